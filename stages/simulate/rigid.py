@@ -50,7 +50,7 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
 from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
 from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, surface_shape
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
 
 log = logging.getLogger(__name__)
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
@@ -229,7 +229,11 @@ class _World:
         scale = self._scene.metres_per_unit / self.units.length
 
         def shape(row: int) -> SurfaceShape:
-            b, surface = self._bodies[row], solid_surface(self._scene, self._ids[row], options.seed)
+            b = self._bodies[row]
+            if b.parts.ball is not None:
+                return ball_shape(scale * (b.parts.ball.centre - b.parts.com.double().numpy()),
+                                  scale * b.parts.ball.radius)  # fmt: skip
+            surface = solid_surface(self._scene, self._ids[row], options.seed)
             ground = b.ground / self._scene.metres_per_unit
             return surface_shape(surface, ground, b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.physics.convex_parts import ConvexParts, fitted_ball
+from stages.core.physics.convex_parts import ConvexParts
 from stages.core.physics.materials import Material
 
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -134,15 +134,14 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, im
         body.add_freejoint()
     # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
     contact = {"solref": [-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], "solimp": impedance}
+    ball = b.parts.ball
+    if ball is not None:  # a polyhedron loses energy where it rolls over its edges
+        arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)
+        at = (ball.centre - b.parts.com.double().numpy()) * unit / units.length
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[ball.radius * unit / units.length, 0, 0], pos=at,
+                      condim=6, friction=[b.friction, 0, arm / units.length], **contact)  # fmt: skip
+        return
     for n, hull in enumerate(b.parts.hulls):
-        ball = fitted_ball(hull)
-        if ball is not None:  # a polyhedron loses energy where it rolls over its edges
-            centre, radius = ball
-            arm = b.rolling_arm(radius * unit, gravity * units.length / units.time**2)
-            at = (centre - b.parts.com).double() * unit / units.length
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius * unit / units.length, 0, 0], pos=at.tolist(),
-                          condim=6, friction=[b.friction, 0, arm / units.length], **contact)  # fmt: skip
-            continue
         vertices = (hull - b.parts.com).double() * unit / units.length
         mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX

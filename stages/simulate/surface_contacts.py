@@ -28,10 +28,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.kernels.depth_lookup import depth_lookup, turned
+from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface
 from stages.simulate.initial_overlaps import WINDOW
 
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
+BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
+BALL_NODES = 16  # along its radius: depths between them are interpolated to .002 radii
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
 CELLS = 2 * GROUPS_ALONG  # cells of that size on each side of a body's centre of mass
 STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
@@ -58,6 +61,15 @@ def surface_shape(body: SolidSurface, bottom: float, com: np.ndarray, scale: flo
     height = low[2] + body.h * np.arange(depth.shape[2])
     return SurfaceShape(scale * (points[above] - com), normals[above], scale * np.minimum(depth, height - bottom),
                         scale * (low - com), scale * body.h, convex)  # fmt: skip
+
+
+def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:
+    """The shape of a ball, in the frame of its body."""
+    normals, h = fibonacci(BALL_SAMPLES), radius / BALL_NODES
+    low = np.full(3, -(BALL_NODES + 2) * h)
+    node = low + h * np.indices((2 * BALL_NODES + 5,) * 3).transpose(1, 2, 3, 0)
+    depth = radius - np.linalg.norm(node, axis=-1)
+    return SurfaceShape(centre + radius * normals, normals, depth, centre + low, h, True)
 
 
 class SurfaceContacts:

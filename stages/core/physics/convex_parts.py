@@ -1,8 +1,9 @@
 """Convex parts of an object, for rigid-body collision, and its volume, centre of mass and inertia.
 
-An object that fills its convex hull is one part. The filled voxels of others are divided by planes (`convex_cuts.py`).
-The hulls are then those of the points of the surface (`solid_surface.py`) at each part's voxels, with their faces moved
-to the mean level of the surface under them. Lengths are in the unit of the Gaussians.
+A round object is a ball (`ball_fit.py`). Of the others, one that fills its convex hull is one part, and the filled
+voxels of the rest are divided by planes (`convex_cuts.py`). The hulls are then those of the points of the surface
+(`solid_surface.py`) at each part's voxels, with their faces moved to the mean level of the surface under them. Lengths
+are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
-from stages.core.kernels.threads import parallel_map, small_operations
+from stages.core.kernels.threads import parallel_map
+from stages.core.physics.ball_fit import DENT, Ball, fitted_ball
 from stages.core.physics.convex_cuts import EXTREMES, divide
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import solid_surface
@@ -24,10 +26,7 @@ from stages.core.scene.scene import Scene
 
 FACING = 0.5  # least cosine between the normal of a surface and that of the face of a hull over it
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
-MAX_VERTICES = 200  # of a part: a ball is round to 1 %
-ROUND = (
-    0.03  # largest distance of a ball's support planes from those of its hull [radius]: 1 % by MAX_VERTICES, and noise
-)
+MAX_VERTICES = 200  # of a part: a cylinder or egg is round to 1 %
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 
 
@@ -55,21 +54,7 @@ class ConvexParts:
     volume: float
     com: Float[Tensor, "3"]
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
-
-
-@small_operations()
-def fitted_ball(hull: Float[Tensor, "v 3"]) -> tuple[Float[Tensor, "3"], float] | None:
-    """Centre and radius of the ball whose support planes are those of a hull to within ROUND; None where none is.
-
-    On one thread, so that its last bits do not depend on their number.
-    """
-    x = hull.double()
-    A = torch.cat([2 * x, torch.ones(len(x), 1, dtype=x.dtype)], 1)  # |x|^2 = 2 x.c + r^2 - |c|^2
-    solution = torch.linalg.lstsq(A, x.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
-    centre = solution[:3]
-    radius = float((solution[3] + centre.square().sum()).clamp_min(0).sqrt())
-    support = ((x - centre) @ torch.from_numpy(EXTREMES).double().mT).amax(0)
-    return (centre.float(), radius) if bool(((support - radius).abs() <= ROUND * radius).all()) else None
+    ball: Ball | None = None  # that a round object is; `hulls` are then its points in EXTREMES
 
 
 @cached_in_scene
@@ -82,7 +67,14 @@ def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[C
     ids = [o.id for o in scene.objects]
     solids = parallel_map(lambda id: _solid(scene, id, seed, bottom), ids)
     # on one thread: small arrays, during which Python holds its lock
-    return [_parts(solid, _around(solids, row), seed) for row, solid in enumerate(solids)]
+    out = []
+    for row, solid in enumerate(solids):
+        ball = fitted_ball(solid.surface, bottom, all_seen=scene.cameras is None)
+        if ball is not None and ball.clear_of(_around(solids, row, DENT * ball.radius)):
+            out.append(_ball_parts(ball))
+        else:
+            out.append(_parts(solid, _around(solids, row, solid.h), seed))
+    return out
 
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
@@ -96,13 +88,21 @@ def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
     return Solid(voxels[inside], depth[inside], body.h, surface, body.normals, seen if len(seen) else voxels, moments)
 
 
-def _around(solids: list[Solid], row: int) -> np.ndarray:
-    """Centres (n, 3) of the voxels of the other solids within the bounds of one of them and not in or next to it."""
+def _around(solids: list[Solid], row: int, margin: float) -> np.ndarray:
+    """Centres (n, 3) of the voxels of the other solids up to a margin outside the bounds of one of them, and not in or
+    next to it.
+    """
     own = solids[row]
-    low, high = own.voxels.min(0) - own.h, own.voxels.max(0) + own.h
+    low, high = own.voxels.min(0) - margin, own.voxels.max(0) + margin
     near = [s.voxels[((s.voxels > low) & (s.voxels < high)).all(1)] for k, s in enumerate(solids) if k != row]
     others = np.concatenate([np.empty((0, 3)), *near])
     return others[cKDTree(own.voxels).query(others, distance_upper_bound=own.h)[0] == np.inf]
+
+
+def _ball_parts(ball: Ball) -> ConvexParts:
+    volume, centre = 4 / 3 * np.pi * ball.radius**3, torch.from_numpy(ball.centre).float()
+    hull = centre + ball.radius * torch.from_numpy(EXTREMES)
+    return ConvexParts((hull,), volume, centre, 0.4 * volume * ball.radius**2 * torch.eye(3), ball)
 
 
 def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:

@@ -1,6 +1,7 @@
 """Convex parts: moments of solids, concave objects, and the surface of voxels."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,8 +9,11 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, Delaunay
 
-from stages.core.physics.convex_cuts import Part, fibonacci
-from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide, fitted_ball
+from stages.core.geometry.cameras import orbit
+from stages.core.physics.convex_cuts import Part
+from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.lab.bench.physics_experiments import bowl
@@ -39,12 +43,35 @@ def test_parts_are_divided_that_are_neither_convex_nor_small(shell, cost, accept
     assert Part(rows, rows[:shell], rows, cost).accepted == accepted
 
 
-def test_a_ball_is_round_to_one_percent():
+def test_a_ball_has_the_moments_of_a_ball():
     parts = convex_parts(scene(ellipsoid((0.1, 0.1, 0.1), 3000)))[0]
     (hull,) = parts.hulls
-    assert len(hull) == 200
-    torch.testing.assert_close(hull.norm(dim=1), torch.full((200,), 0.1), rtol=1e-3, atol=0)
-    assert float(parts.inertia[0, 0]) == pytest.approx(0.4 * parts.volume * 0.01, rel=0.01)
+    torch.testing.assert_close(hull.norm(dim=1), torch.full((len(hull),), 0.1), rtol=1e-3, atol=0)
+    assert parts.ball.radius == pytest.approx(0.1, rel=1e-3)
+    assert parts.volume == pytest.approx(4 / 3 * math.pi * 1e-3, rel=3e-3)
+    torch.testing.assert_close(parts.inertia, 0.4 * parts.volume * 0.01 * torch.eye(3), rtol=3e-3, atol=1e-12)
+
+
+def test_an_egg_is_round_to_one_percent():
+    radii = torch.tensor([0.1, 0.1, 0.12])
+    parts = convex_parts(scene(ellipsoid(tuple(radii.tolist()), 3000)))[0]
+    (hull,) = parts.hulls
+    assert parts.ball is None and len(hull) == 200
+    torch.testing.assert_close((hull / radii).norm(dim=1), torch.ones(200), rtol=1e-3, atol=0)
+    expected = parts.volume / 5 * (radii.square().sum() - radii.square())
+    torch.testing.assert_close(parts.inertia.diagonal(), expected, rtol=0.01, atol=0)
+
+
+def test_a_ball_does_not_reach_into_another_object():
+    """A ball of which a tenth of the height is cut off on a block: the rest of the ball would be inside it."""
+    dome = ellipsoid((0.1,) * 3, 3000)
+    dome = together(dome.kept(dome.points[:, 2] > -0.08), disc(0, 0.06, -0.08))
+    block = box((0.3, 0.3, 0.1), 0.01).moved((0.0, 0.0, -0.131))
+    grey = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i) for i, s in enumerate((dome, block), start=1)]
+    cameras = orbit(2, torch.zeros(3), 1.0, 20.0), torch.eye(3).expand(2, 3, 3), torch.full((2, 2), 100), ("a", "b")
+    seen = Scene(grey[0], (SceneObject(1, "dome"),), Cameras(*cameras))
+    on_block = replace(seen, gaussians=concatenate(grey), objects=(*seen.objects, SceneObject(2, "block")))
+    assert convex_parts(seen)[0].ball is not None and convex_parts(on_block)[0].ball is None
 
 
 def test_inertia_of_two_cubes_that_are_one_object():
@@ -206,20 +233,3 @@ def test_parts_of_a_shell_follow_its_inner_surface():
         first = np.where(enter <= leave, np.minimum(first, enter), first)
     h = 2 * outer / 48
     assert abs(np.median(first) - inner) < h / 3 and first.min() > inner - h
-
-
-def test_balls_are_recognised_by_their_support_planes():
-    sphere = torch.from_numpy(fibonacci(150)).float()
-    noise = 1 + 0.01 * torch.randn(len(sphere), 1, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
-    centre, radius = fitted_ball(0.2 * noise * sphere + torch.tensor([1.0, -2.0, 3.0]))
-    torch.testing.assert_close(centre, torch.tensor([1.0, -2.0, 3.0]), rtol=0, atol=2e-3)
-    assert radius == pytest.approx(0.2, rel=0.01)
-    dome, egg = sphere[sphere[:, 2] > -0.6], sphere * torch.tensor([1.0, 1.0, 1.1])
-    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-    assert fitted_ball(dome) is None and fitted_ball(egg) is None and fitted_ball(cube) is None
-
-
-def test_a_ball_does_not_depend_on_the_number_of_threads(with_threads):
-    hull = 0.1 * torch.from_numpy(fibonacci(100)).float() + 0.3  # last bits differ if threads share the sums
-    (one, r), (two, q) = (with_threads(count, fitted_ball, hull) for count in (1, 2))
-    assert torch.equal(one, two) and r == q

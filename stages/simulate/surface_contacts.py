@@ -34,7 +34,7 @@ from stages.simulate.initial_overlaps import WINDOW
 
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
-BALL_NODES = 16  # along its radius: depths between them are interpolated to .002 radii
+BALL_NODES = 20  # along its radius: depths between them are interpolated to .001 radii
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
 CELLS = 2 * GROUPS_ALONG  # cells of that size on each side of a body's centre of mass
 STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel

@@ -7,23 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface, _voxels_along, solid_surface
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, surface_shape
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
 from tests.simulate.motion import roll_out
 from tests.simulate.test_rigid import cube, options_of, scene_of
 
 mujoco = pytest.importorskip("mujoco")
 
 
-def ball(radius: float, convex: bool = False, count: int = 2000) -> SurfaceShape:
-    """A ball in a grid whose nodes are a twentieth of its radius apart."""
-    h, normals = radius / 20, fibonacci(count)
-    line = np.arange(-1.2 * radius, 1.2 * radius, h)
-    x = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
-    return SurfaceShape(radius * normals, normals, radius - np.linalg.norm(x, axis=-1), x[0, 0, 0], h, convex)
+def ball(radius: float, convex: bool = False) -> SurfaceShape:
+    """A ball around the origin."""
+    return replace(ball_shape(np.zeros(3), radius), convex=convex)
 
 
 class Pair:

@@ -315,6 +315,16 @@ def strictly_inside(points: torch.Tensor, sides: tuple, at: tuple) -> torch.Tens
     return ((points - torch.tensor(at)).abs() < torch.tensor(sides) / 2 - 1e-4).all(1)
 
 
+def test_a_ball_rests_on_a_body_of_several_parts_whatever_sticks_out_of_its_surface(tmp_path):
+    """A tuft of .08 radii points downwards, on which it would tip over."""
+    below = BALL.points[:, 2] < 0.002
+    points = BALL.points.clone()
+    points[below, 2] -= 0.008
+    ball = Surface(points, BALL.normals).moved((0.0, 0.0, 0.31))
+    t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), ball, pin=("1",), steps=30)
+    torch.testing.assert_close(t.com[-1, 1], torch.tensor([0.0, 0.0, 0.4]), rtol=0, atol=2e-3)
+
+
 @pytest.mark.parametrize("friction", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
 def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
     t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), cross().moved((-0.3, 0, 0.325)), pin=("1",), friction=friction,

@@ -1,5 +1,6 @@
 """Properties of the force field that hold for any weights."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -13,9 +14,9 @@ from stages.core.models.field.contact_forces import ContactPoints
 from stages.core.models.field.deformation import DeformationInputs, projected
 from stages.core.models.field.floor_response import MAX_PENETRATION, SEPARATION_SPEED, friction_factor, push_only
 from stages.core.models.field.force_field import MAX_TRAINED_STIFFNESS, ForceField
-from stages.core.models.field.rest_shape import rest_shape_of
+from stages.core.models.field.rest_shape import RestShape, rest_shape_of
 from stages.core.models.initial_conditions import BOX, InitialConditions, centre_of_mass
-from tests.core.models.dynamics_fixtures import external_force, overlapping_objects
+from tests.core.models.dynamics_fixtures import add_padding, external_force, overlapping_objects
 
 LARGE_BOX = torch.tensor([[-50.0] * 3, [50.0] * 3], dtype=torch.float64)
 ZERO = torch.zeros(3, dtype=torch.float64)
@@ -335,6 +336,34 @@ def test_others_and_back_indices_are_inverse_to_each_other():
         assert sorted(shape.others[i].tolist()) == [j for j in range(4) if j != i]
         for k, j in enumerate(shape.others[i].tolist()):
             assert shape.others[j, shape.back[i, k]] == i
+
+
+def groups_of_objects() -> InitialConditions:
+    """Objects 0 and 1, objects 2 to 4, and object 5 are each near one another; with padding."""
+    near = overlapping_objects(2, 6)
+    along = torch.tensor([0.0, 0.1, 0.9, 1.0, 1.1, 3.0], dtype=torch.float64)
+    points = near.points + along[:, None, None] * torch.tensor([1.0, 0, 0])
+    fields = {name: getattr(near, name) for name in ("mass", "E", "nu", "friction", "velocity", "spin")}
+    return add_padding(InitialConditions.of(points, box=LARGE_BOX, **fields), 1, 2)
+
+
+def test_near_others_are_those_within_reach_and_back_leads_to_the_object():
+    shape = rest_shape_of(groups_of_objects())
+    near = shape.with_near_others(shape.initial.points, 0.2)
+    assert near.others.tolist() == [[1, 0], [0, 1], [3, 4], [2, 4], [2, 3], [5, 5], [6, 6]]
+    for i, k in itertools.product(range(7), range(2)):
+        assert near.others[near.others[i, k], near.back[i, k]] == i
+    assert shape.with_near_others(shape.initial.points, 10.0).others.shape == (7, 5)  # the padded object has none
+
+
+@torch.no_grad()
+def test_pairs_out_of_reach_do_not_matter(monkeypatch):
+    initial, model = groups_of_objects(), model_with_amplified_forces()
+    near = model.rollout(initial, 10)
+    monkeypatch.setattr(RestShape, "with_near_others", lambda shape, *_: shape)
+    everyone = model.rollout(initial, 10)
+    assert (near - initial.points[:, None]).norm(dim=-1).max() > 0.01
+    torch.testing.assert_close(near, everyone, **EXACT)
 
 
 @torch.no_grad()

@@ -23,6 +23,7 @@ from stages.core.models.field.contact_forces import ContactNet, ContactPoints
 from stages.core.models.field.contact_points import (
     ARM_UNIT,
     GAP_UNIT,
+    SEARCH_RADIUS,
     BodyKinematics,
     floor_contacts,
     pair_contacts,
@@ -259,6 +260,9 @@ class ForceField(Dynamics):
     def _contact(self, scene: FieldScene, bodies: BodyKinematics, external: ExternalForces) -> ContactEffect:
         """One round of contact message passing: encode, aggregate, update, decode; then the sum of the forces."""
         shape, embedding = scene.shape, scene.embedding
+        if not (bodies.points.is_cuda or torch.is_grad_enabled() or torch.compiler.is_compiling()):
+            # on a GPU the host would have to wait for their number
+            shape = shape.with_near_others(bodies.points, SEARCH_RADIUS)
         w, others, back = shape.initial, shape.others, shape.back
         pairs, floor, wall = pair_contacts(shape, bodies), floor_contacts(shape, bodies), wall_contacts(shape, bodies)
         x, weight, mean = self.pairs.encode(pairs, _fractions(w, pairs), embedding, embedding[:, others])

@@ -35,13 +35,34 @@ class RestShape:
     keypoint_inverse: Float[Tensor, "b o 3 3"]  # the same of the keypoints alone, as of a hollow body [1/m^2]
     principal: Float[Tensor, "b o 3"]  # eigenvalues of `keypoint_inverse`, ascending [1/m^2]
     blur: Float[Tensor, "b o s n n"]  # averaging weights of the neighbourhoods, rows sum to 1; 16-bit for the kernels
-    others: Int[Tensor, "o m"]  # for each object the indices of the m = o - 1 others
+    others: Int[Tensor, "o m"]  # for each object the indices of the m = o - 1 others, or of those near it
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
 
     def __getitem__(self, rows: slice | Tensor) -> RestShape:
         """The scenes `rows`, still a batch."""
         batched = ("initial", "arm", "normal", "spacing", "size", "inverse", "keypoint_inverse", "principal", "blur")
         return replace(self, **{name: getattr(self, name)[rows] for name in batched})
+
+
+    def with_near_others(self, points: Float[Tensor, "b o n 3"], reach: float) -> RestShape:
+        """The same where an object's partners are those whose bounding boxes are within `reach` [m] in any scene.
+
+        Objects with fewer partners than the most have themselves as the remaining ones, which they do not touch.
+        """
+        valid = self.initial.valid[..., None]
+        low = points.masked_fill(~valid, torch.inf).amin(2)
+        high = points.masked_fill(~valid, -torch.inf).amax(2)
+        near = (low[:, :, None] < high[:, None] + reach).all(-1)
+        near = (near & near.mT).any(0).fill_diagonal_(False)
+        if (count := int(near.sum(1).max())) >= self.others.shape[1]:
+            return self
+        row = torch.arange(len(near), device=near.device)[:, None]
+        column = torch.arange(count, device=near.device)
+        real = column < near.sum(1, keepdim=True)
+        first = (~near).int().argsort(dim=1, stable=True)[:, :count]  # the near ones, in order
+        rank = near.cumsum(1) - 1  # of each partner among those of an object
+        others = torch.where(real, first, row)
+        return replace(self, others=others, back=torch.where(real, rank[others, row], column))
 
 
 @torch.no_grad()

@@ -2,11 +2,13 @@
 
 import itertools
 
+import pytest
 import torch
 from torch.testing import assert_close
 
+from stages.core.models.segmenter import segment
 from stages.core.models.segmenter.network import PAIR_FEATURES, Prediction, Segmenter
-from stages.core.models.segmenter.segment import COPIES, averaged_prediction
+from stages.core.models.segmenter.segment import COPIES, TURNS, averaged_prediction
 from stages.core.models.segmenter.voxels import LAB, ScenePoints, voxelise
 
 
@@ -23,7 +25,13 @@ class _Vectors(Segmenter):
         return Prediction(features[:, LAB], features[:, 3:6], call)
 
 
-def test_offsets_are_turned_back_and_all_copies_count_alike():
+QUARTER = ((0, -1, 0), (1, 0, 0), (0, 0, 1))  # unlike TURNS not its own inverse
+
+
+@pytest.mark.parametrize("turn", [None, QUARTER])
+def test_offsets_are_turned_back_and_all_copies_count_alike(turn, monkeypatch):
+    if turn is not None:
+        monkeypatch.setattr(segment, "TURNS", (TURNS[0], turn, *TURNS[2:]))
     surfels = ball()
     grid, model = voxelise(surfels), _Vectors()
     levels, found = averaged_prediction(surfels, grid, model)

@@ -61,7 +61,7 @@ class ContactNet(nn.Module):
         embedding_term = self.own_projection(own)[:, :, None, None]
         if self.partner_projection is not None:
             embedding_term = embedding_term + self.partner_projection(other)[:, :, :, None]
-        x = _at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, embedding_term)
+        x = at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, embedding_term)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
         weight = contacts.gate * mass_fraction * attention
         weight = weight / (weight.sum(-1, keepdim=True) + CONTACT_SATURATION)
@@ -77,7 +77,7 @@ class ContactNet(nn.Module):
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
         """Acceleration of the object by each contact point, times its weight [m/s^2]."""
         context_term = self.context_projection(context)[:, :, :, None]
-        return _at_contacts(weight > 0, self._force, message, context_term, vectors, weight[..., None])
+        return at_contacts(weight > 0, self._force, message, context_term, vectors, weight[..., None])
 
     def _force(
         self, message: Tensor, offset: Tensor, vectors: Tensor, weight: Tensor, needed: Tensor | None = None
@@ -87,7 +87,7 @@ class ContactNet(nn.Module):
         return weight * ACCELERATION_UNIT * weighted_sum(coefficients, vectors)
 
 
-def _at_contacts(
+def at_contacts(
     needed: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *inputs: Tensor
 ) -> Float[Tensor, "b o m n _"]:
     """f of the rows of `inputs`, computed only where `needed`: a CPU gathers those rows and leaves 0 elsewhere.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.models.dynamics import FRAME
-from stages.core.models.field.contact_forces import ContactPoints
+from stages.core.models.field.contact_forces import ContactPoints, at_contacts
 from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm, symmetric_solve
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.field.rest_shape import RestShape
@@ -48,32 +48,50 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     w, others = shape.initial, shape.others
     own, partner, distance = _nearest_pairs(shape, bodies)
     b, o, m, _ = own.shape
-    state = torch.cat([bodies.points, bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None]], -1)
-    own_state = _gather_points(state, own + w.valid.shape[2] * torch.arange(o, device=own.device)[:, None, None])
-    partner_state = _gather_points(state, partner)
-    gap, approach = (own_state - partner_state)[..., :3], (own_state - partner_state)[..., 3:6]
-    relative = (bodies.velocity[:, :, None] - bodies.velocity[:, others])[:, :, :, None].expand_as(gap)
-    gravity = (w.gravity / 5)[:, None, None, None].expand_as(gap)
+    n = w.valid.shape[2]
+    scene = n * o * torch.arange(b, device=own.device)[:, None, None, None]
+    rows = scene + n * torch.arange(o, device=own.device)[:, None, None] + own, scene + partner  # in the batch
+    motion = torch.cat([bodies.points, bodies.point_velocity], -1).flatten(0, 2)
+    difference = _rows(motion, rows[0]) - _rows(motion, rows[1])
+    gap, approach = difference.split(3, -1)
     now, ahead = smooth_norm(gap), smooth_norm(gap + FRAME * approach)
     gate = torch.where(
         distance.isfinite(), smooth_cutoff(torch.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), 0.0
     )  # fmt: skip
     mass = w.mass.clamp_min(1e-6)
-    ratio = (mass[:, others] / (mass[:, :, None] + mass[:, others]))[..., None, None, None]
-    K = ratio * _impulse_response(bodies.inverse[:, :, None, None], own_state[..., 9:12])
-    K = K + (1 - ratio) * _impulse_response(bodies.inverse[:, others][:, :, :, None], partner_state[..., 9:12])
-    vectors = torch.stack([
-        gap / GAP_UNIT, own_state[..., 6:9], partner_state[..., 6:9], approach, own_state[..., 9:12] / ARM_UNIT,
-        partner_state[..., 9:12] / ARM_UNIT, relative, gravity, *symmetric_solve(K, approach, partner_state[..., 6:9]),
-    ], -2)  # fmt: skip
+    ratio = mass[:, others] / (mass[:, :, None] + mass[:, others])
+    relative = bodies.velocity[:, :, None] - bodies.velocity[:, others]
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
-    scalars = torch.cat([
-        torch.stack([
-            now / GAP_UNIT, ahead / GAP_UNIT, gate, own_state[..., 12] / GAP_UNIT, partner_state[..., 12] / GAP_UNIT
-        ], -1),
-        sizes[:, :, :, None].expand(*now.shape, 2),
-    ], -1)  # fmt: skip
-    return ContactPoints(_within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1), gate, own)
+    state = torch.cat([bodies.normal, bodies.arm, shape.spacing[..., None]], -1).flatten(0, 2)
+
+    def features(
+        own: Tensor, partner: Tensor, difference: Tensor, distances: Tensor, inverse: Tensor, other_inverse: Tensor,
+        ratio: Tensor, relative: Tensor, gravity: Tensor, sizes: Tensor, needed: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Vectors, one after the other, and scalars."""
+        gap, approach = difference.split(3, -1)
+        own_normal, own_arm, own_spacing = _rows(state, own).split([3, 3, 1], -1)
+        normal, arm, spacing = _rows(state, partner).split([3, 3, 1], -1)
+        ratio = ratio[..., None, None]
+        K = ratio * _impulse_response(inverse, own_arm) + (1 - ratio) * _impulse_response(other_inverse, arm)
+        vectors = torch.cat([
+            gap / GAP_UNIT, own_normal, normal, approach, own_arm / ARM_UNIT, arm / ARM_UNIT, relative.expand_as(gap),
+            gravity.expand_as(gap), *symmetric_solve(K, approach, normal),
+        ], -1)  # fmt: skip
+        sizes = sizes.expand(*gap.shape[:-1], 2)
+        return torch.cat([vectors, distances, own_spacing / GAP_UNIT, spacing / GAP_UNIT, sizes], -1)
+
+    of_pairs = [bodies.inverse[:, :, None], bodies.inverse[:, others], ratio, relative, (w.gravity / 5)[:, None, None],
+                sizes]  # fmt: skip
+    distances = torch.stack([now / GAP_UNIT, ahead / GAP_UNIT, gate], -1)
+    values = at_contacts(gate > 0, features, *rows, difference, distances, *(x[:, :, :, None] for x in of_pairs))
+    values = _within_cutoff(values, gate)
+    return ContactPoints(values[..., :30].unflatten(-1, (10, 3)), values[..., 30:], gate, own)
+
+
+def _rows(x: Float[Tensor, "n c"], index: Int[Tensor, "*p"]) -> Float[Tensor, "*p c"]:
+    """Rows of x; unlike that of `x[index]`, the gradient needs no sorting."""
+    return x.index_select(0, index.flatten()).reshape(*index.shape, x.shape[1])
 
 
 def _nearest_pairs(
@@ -163,23 +181,35 @@ def _plane_contacts(
     w = shape.initial
     state = [bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None], w.valid[..., None]]
     state = _gather_own(torch.cat(state, -1), row)
-    velocity, arm = state[..., :3], state[..., 6:9]
-    body_velocity, gravity = bodies.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
-    ahead = height + FRAME * (velocity * normal).sum(-1)
+    ahead = height + FRAME * (state[..., :3] * normal).sum(-1)
     gate = smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT)
     gate = torch.where(state[..., 10] > 0, gate, 0.0)
-    K = _impulse_response(bodies.inverse[:, :, None], arm)
-    vectors = torch.stack([
-        normal, state[..., 3:6], velocity, arm / ARM_UNIT, body_velocity, gravity, *symmetric_solve(K, velocity, normal)
-    ], -2)  # fmt: skip
-    scalars = torch.stack([
-        (height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate, state[..., 9] / GAP_UNIT,
-        shape.size[..., None].log().expand_as(height),
-    ], -1)  # fmt: skip
-    vectors, scalars = _within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1)
-    return ContactPoints(vectors[:, :, None], scalars[:, :, None], gate[:, :, None], row[:, :, None])
+
+    def features(
+        state: Tensor, normal: Tensor, distances: Tensor, inverse: Tensor, velocity: Tensor, gravity: Tensor,
+        size: Tensor, needed: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Vectors, one after the other, and scalars."""
+        point_velocity, own_normal, arm, spacing, _ = state.split([3, 3, 3, 1, 1], -1)
+        K = _impulse_response(inverse, arm)
+        vectors = torch.cat([
+            normal, own_normal, point_velocity, arm / ARM_UNIT, velocity.expand_as(arm), gravity.expand_as(arm),
+            *symmetric_solve(K, point_velocity, normal),
+        ], -1)  # fmt: skip
+        return torch.cat([vectors, distances, spacing / GAP_UNIT, size.expand_as(spacing)], -1)
+
+    of_points = [
+        state,
+        normal,
+        torch.stack([(height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate], -1),
+    ]
+    of_bodies = [bodies.inverse, bodies.velocity, (w.gravity / 5)[:, None], shape.size[..., None].log()]
+    inputs = [*(x[:, :, None] for x in of_points), *(x[:, :, None, None] for x in of_bodies)]
+    gate = gate[:, :, None]
+    values = _within_cutoff(at_contacts(gate > 0, features, *inputs), gate)
+    return ContactPoints(values[..., :24].unflatten(-1, (8, 3)), values[..., 24:], gate, row[:, :, None])
 
 
-def _within_cutoff(x: Tensor, gate: Tensor, extra_dims: int) -> Tensor:
+def _within_cutoff(x: Float[Tensor, "*p c"], gate: Float[Tensor, "*p"]) -> Float[Tensor, "*p c"]:
     """Features with 0 where the gate is 0: there they may be huge, and must not enter the gradient."""
-    return torch.where(gate[(...,) + (None,) * extra_dims] > 0, x, 0.0)
+    return torch.where(gate[..., None] > 0, x, 0.0)

@@ -43,7 +43,6 @@ class RestShape:
         batched = ("initial", "arm", "normal", "spacing", "size", "inverse", "keypoint_inverse", "principal", "blur")
         return replace(self, **{name: getattr(self, name)[rows] for name in batched})
 
-
     def with_near_others(self, points: Float[Tensor, "b o n 3"], reach: float) -> RestShape:
         """The same where an object's partners are those whose bounding boxes are within `reach` [m] in any scene.
 

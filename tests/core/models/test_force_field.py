@@ -366,6 +366,23 @@ def test_pairs_out_of_reach_do_not_matter(monkeypatch):
     torch.testing.assert_close(near, everyone, **EXACT)
 
 
+def test_features_of_all_rows_equal_those_of_the_needed_ones(monkeypatch):
+    """A GPU computes all rows, and a CPU those in contact; so do their gradients."""
+    model, found = model_with_amplified_forces(), []
+    for dense in (False, True):
+        monkeypatch.setattr(torch.compiler, "is_compiling", lambda dense=dense: dense)
+        initial = groups_of_objects()
+        initial.velocity.requires_grad_()
+        x = model.rollout(initial, 3)
+        weights = [p for p in model.parameters() if p.requires_grad]
+        found.append(
+            [x.detach(), *torch.autograd.grad(x.square().sum(), [initial.velocity, *weights], allow_unused=True)]
+        )
+    assert sum(g is not None for g in found[0]) > 20
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
 @torch.no_grad()
 def test_rollouts_are_deterministic():
     initial = overlapping_objects().to(torch.float32)

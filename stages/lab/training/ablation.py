@@ -38,7 +38,7 @@ class NoReaction(_UnfusedForceField):
     """Contact forces act on one body only: each side of a contact predicts its own, independent force."""
 
     def _reaction(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
-        return torch.zeros_like(x[:, :, 0])
+        return torch.zeros_like(x.sum(2))
 
 
 class NoMaterialInputs(_UnfusedForceField):

@@ -48,9 +48,8 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     w, others = shape.initial, shape.others
     own, partner, distance = _nearest_pairs(shape, bodies)
     b, o, m, _ = own.shape
-    n = w.valid.shape[2]
-    scene = n * o * torch.arange(b, device=own.device)[:, None, None, None]
-    rows = scene + n * torch.arange(o, device=own.device)[:, None, None] + own, scene + partner  # in the batch
+    first = w.valid.shape[2] * torch.arange(b * o, device=own.device).view(b, o, 1, 1)  # keypoint of each object
+    rows = first + own, partner
     motion = torch.cat([bodies.points, bodies.point_velocity], -1).flatten(0, 2)
     difference = _rows(motion, rows[0]) - _rows(motion, rows[1])
     gap, approach = difference.split(3, -1)
@@ -99,7 +98,7 @@ def _nearest_pairs(
 ) -> tuple[Int[Tensor, "b o m k"], Int[Tensor, "b o m k"], Float[Tensor, "b o m k"]]:
     """Keypoints of each object near each partner, the partner's nearest ones, and their distances [m].
 
-    The second are counted through all objects of the scene; distances are infinite where there is no contact.
+    The second are counted through all objects of the batch; distances are infinite where there is no contact.
     """
     w, others = shape.initial, shape.others
     distance, index = nearest(bodies.points, w.valid, SEARCH_RADIUS)
@@ -107,22 +106,16 @@ def _nearest_pairs(
     count = math.ceil(PAIR_FRACTION * n)
     pick = others[None, :, :, None].expand(b, o, others.shape[1], n)
     distance, index = distance.gather(2, pick), index.gather(2, pick)
-    partner = index + n * others[:, :, None]
+    partner = index + n * (others + o * torch.arange(b, device=others.device)[:, None, None])[..., None]
     if count >= n:
         return torch.arange(n, device=index.device).expand_as(index), partner, distance
     with torch.no_grad():
         ahead = bodies.points + FRAME * bodies.point_velocity
-        ahead = smooth_norm(ahead[:, :, None] - _gather_points(ahead, partner))
+        ahead = smooth_norm(ahead[:, :, None] - _rows(ahead.flatten(0, 2), partner))
         key = torch.where(distance.isfinite(), torch.minimum(distance, ahead), torch.inf)
         own = key.topk(count, largest=False).indices
     partner, distance = partner.gather(-1, own), distance.gather(-1, own)
     return own, partner, distance.masked_fill(_beyond(own, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
-
-
-def _gather_points(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tensor, "b *p c"]:
-    """Values at keypoints, counted through all objects of a scene."""
-    flat = rows.flatten(1)[..., None].expand(-1, -1, x.shape[-1])
-    return x.flatten(1, 2).gather(1, flat).reshape(*rows.shape, x.shape[-1])
 
 
 def _impulse_response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3 3"]:

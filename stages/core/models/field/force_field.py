@@ -260,7 +260,7 @@ class ForceField(Dynamics):
     def _contact(self, scene: FieldScene, bodies: BodyKinematics, external: ExternalForces) -> ContactEffect:
         """One round of contact message passing: encode, aggregate, update, decode; then the sum of the forces."""
         shape, embedding = scene.shape, scene.embedding
-        if not (bodies.points.is_cuda or torch.is_grad_enabled() or torch.compiler.is_compiling()):
+        if not (bodies.points.is_cuda or torch.compiler.is_compiling()):
             # on a GPU the host would have to wait for their number
             shape = shape.with_near_others(bodies.points, SEARCH_RADIUS)
         w, others, back = shape.initial, shape.others, shape.back

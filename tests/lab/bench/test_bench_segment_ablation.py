@@ -40,11 +40,11 @@ def scenes(tmp_path):
     return tmp_path
 
 
-def test_ablations_are_trained_and_judged(scenes, monkeypatch):
+def test_ablations_are_trained_and_judged(scenes, monkeypatch, device):
     monkeypatch.setattr(bench, "TRAINING", {"score_scenes": 1, "score_steps": 2, "widths": (4, 8), "blocks": 1})
     out = scenes / "rows.json"
     command = ["bench", "segment-ablation", scenes / "train", "--scores", scenes / "scores", "--judge",
-               scenes / "judge", "--steps", "2", "--batch", "1", "--device", "cpu", "-o", out]  # fmt: skip
+               scenes / "judge", "--steps", "2", "--batch", "1", "--device", device, "-o", out]  # fmt: skip
     names = ["colour", "noise", "clutter"]
     result = CliRunner().invoke(app, [*map(str, command), *(word for name in names for word in ("--only", name))])
     assert result.exit_code == 0, result.output

@@ -4,7 +4,6 @@ import hashlib
 import json
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,14 +167,17 @@ def test_damaged_files_are_found_and_repaired(data, options):
 
 def test_killed_run_resumes_to_the_same_bytes(data, tmp_path, options):
     part = f"replace(OPTIONS, only='scenes,mpm', device={options.device!r})"
-    code = ("from dataclasses import replace; from pathlib import Path; from stages.lab.dataset import generate\n"
+    code = ("import os; from dataclasses import replace; from pathlib import Path\n"
+            "from stages.lab.dataset import gaussian_frames, generate\n"
             "from tests.lab.small_world import OPTIONS, shrink_process; shrink_process()\n"
+            "write = gaussian_frames._write\n"
+            "def killed_after_first_frame(path, **arrays):\n"
+            "    write(path, **arrays)\n"
+            "    path.name == '0000.h5' and os.kill(os.getpid(), 9)\n"
+            "gaussian_frames._write = killed_after_first_frame\n"
             f"generate.run(Path({str(tmp_path)!r}), {part})")  # fmt: skip
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
-    while process.poll() is None and not list(tmp_path.glob("mpm/3_9/.part-*/0000.h5")):
-        time.sleep(0.002)
-    process.kill()
-    process.wait()
+    process = subprocess.run([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    assert process.returncode == -9 and list(tmp_path.glob("mpm/3_9/.part-*/0000.h5"))
     assert not (tmp_path / "sums" / "3_9.sha256").exists()  # the group was not complete
     generate.run(tmp_path, replace(options, only="scenes,mpm"))
     files = {n: d for n, d in digests(tmp_path).items() if n.startswith(("scene", "mpm", "objects"))}

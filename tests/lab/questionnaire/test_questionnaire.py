@@ -157,16 +157,16 @@ def test_participants_of_known_opinion_in_a_browser(study, open_page, tmp_path):
     assert table["groups"]["all"]["PhysR"]["counts"][1] + table["groups"]["all"]["PhysR"]["counts"][4] == 8
 
 
-def test_a_page_goes_on_where_it_was_left_and_takes_answers_back(study, open_page, tmp_path):
+def test_a_page_goes_on_where_it_was_left_and_takes_answers_back(films, open_page, tmp_path):
+    study = tmp_path / "study"  # its own: the browser keeps the answers to a study from test to test
+    run(films, study, StudyOptions(participants=1, films=4, seed=7))
     key = json.loads((study / "key.json").read_text())
-    page = open_study(open_page, study, "2")
-    page.evaluate("localStorage.clear()")
-    page.reload()
+    page = open_study(open_page, study, "1")
     page.click("#start")
     until(page, "!document.querySelector('fieldset').disabled")
     for press in ("4", "3", "Backspace", "1", "Enter"):
         page.keyboard.press(press)
-    until(page, f"document.querySelector('video').src.includes('{key['participants']['2'][1]}')")
+    until(page, f"document.querySelector('video').src.includes('{key['participants']['1'][1]}')")
     page.reload()
     until(page, "document.querySelector('#count').textContent === 'film 2 of 4'")
     page.keyboard.press("PageUp")

@@ -17,13 +17,13 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.cells import distinct_cells
 from stages.core.geometry.harmonics import evaluate_sh, rgb_to_sh
 from stages.core.geometry.neighbours import knn
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.perception.support import Support
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import DISC_SIGMA, disc_gaussians
 from stages.refine.inpaint import inpaint
-from stages.refine.observed_space import ObservedSpace
 
 # Lengths in camera distances (see `ViewExtent`) were tuned on photos of tabletops taken from all around.
 MAX_VIEW_CELLS = 1024  # cells along the longer side of the top view

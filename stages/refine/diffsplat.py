@@ -13,13 +13,13 @@ from pathlib import Path
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models.diffsplat.weights import Files, find, load
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import empty_like
 from stages.refine.library import matched_hints, opaque_gaussians, place_whole
 from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
-from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 from stages.refine.registration import MIN_REGISTRATION_POINTS, register
 

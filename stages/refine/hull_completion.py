@@ -14,11 +14,11 @@ from torch import Tensor
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.perception.support import Support, topples
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import disc_gaussians, empty_like
-from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 
 MIN_GAUSSIANS = 16  # of an object that is completed

@@ -19,13 +19,13 @@ from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.similarity import Similarity
 from stages.core.models.matching.weights import Matcher, load_matcher
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.refine.disc_gaussians import empty_like
 from stages.refine.object_crop import ObjectCrop, crop_object
-from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 from stages.refine.registration import (
     MIN_REGISTRATION_POINTS,

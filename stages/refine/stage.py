@@ -14,6 +14,7 @@ from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.kernels.threads import parallel_map
+from stages.core.perception.observed_space import ObservedSpace, object_psnr
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
@@ -23,7 +24,6 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.refine.background import fill_background
 from stages.refine.disc_gaussians import empty_like
-from stages.refine.observed_space import ObservedSpace, object_psnr
 from stages.refine.options import BACKENDS, CONCURRENT, RefineOptions
 from stages.refine.outliers import floaters
 

@@ -1,6 +1,7 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
-penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest and the one
+penetration: deepest keypoint of an object inside another one or below the floor, where the table has not ended (with an
+engine that ends it), beyond the depth at rest and the one
 to which --lift put it there, of which a warning tells, relative to the smaller height of both. A keypoint outside its
 own mean surface, by noise or as a floater, counts by so much less; in other objects, so does one below the floor at
 rest, where bodies end.
@@ -27,6 +28,7 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import SimulateOptions
+from stages.simulate.setup import table_of
 
 log = logging.getLogger(__name__)
 BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a warning is logged
@@ -47,6 +49,8 @@ class PlausibilityMonitor:
         self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest])
         self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._floor = options.floor if options.floor is not None else scene.floor
+        self._table = table_of(scene, options) if options.engine == "rigid" else None
+        self._left = np.zeros(len(scene.objects), bool)  # the table, over its edge
         self._surface, self._outside = cache(self._surface_of), cache(self._outside_of)
         self._at_rest = cache(self._rest_depth)
         count = len(scene.objects)
@@ -80,12 +84,14 @@ class PlausibilityMonitor:
         moved = np.linalg.norm(com - self._origin, axis=1) > MOVED * self._size
         low = np.array([p.min(0) if len(p) else np.full(3, np.inf) for p in points])
         high = np.array([p.max(0) if len(p) else np.full(3, -np.inf) for p in points])
-        for a in np.flatnonzero(moved):
+        if self._table is not None:
+            self._left |= (self._table.beyond(com) > 0) & (com[:, 2] < self._floor)
+        for a in np.flatnonzero(moved & ~self._left):
             if self._floor is not None and len(points[a]):
-                below, seen = (
-                    float((self._floor - p[:, 2] - self._outside(a)).max()) for p in (points[a], self._rest[a])
-                )
-                self._record(a, below - max(seen, 0.0), self._height[a], "the floor")
+                below, seen = (self._floor - p[:, 2] - self._outside(a) for p in (points[a], self._rest[a]))
+                if self._table is not None:
+                    below = np.where(self._table.beyond(points[a]) > 0, 0.0, below)
+                self._record(a, float(below.max() - max(seen.max(), 0.0)), self._height[a], "the floor")
         near = ((low[:, None] < high) & (low < high[:, None])).all(-1) & (moved[:, None] | moved)
         for a, b in zip(*np.nonzero(near), strict=True):
             if a != b:
@@ -154,6 +160,17 @@ class PlausibilityMonitor:
         converted = max(energy[0] - energy.min(), 1e-3 * abs(self._g) * float(self._size.min()), 1e-12)
         return float(max(energy.max() - energy[0], 0.0) / converted)
 
+    def _warn_of_edges(self) -> None:
+        """Of objects beyond the edge of the table, with engines whose floor has none."""
+        if self._table is not None or not self._com:
+            return
+        far = np.linalg.norm(self._com[-1] - self._origin, axis=1) > self._size
+        table = table_of(self._scene, self._options) if far.any() else None
+        for row in [] if table is None else np.flatnonzero((table.beyond(self._com[-1]) > 0) & far):
+            o = self._scene.objects[row]
+            log.warning("object %d (%s) is beyond the edge of the table, where --engine %s continues the floor; "
+                        "--engine rigid does not", o.id, o.name, self._options.engine)  # fmt: skip
+
     def warn(self, result: dict) -> None:
         """Log what is out of bounds, with the objects and what to do."""
         materials = choose_materials(self._scene.objects, self._options.material, self._options.materials)
@@ -166,6 +183,7 @@ class PlausibilityMonitor:
                 one, into = self._scene.objects[a], self._scene.objects[b]
                 log.warning("--lift puts object %d (%s) and object %d (%s) into each other by %.0f %% of the smaller "
                             "height", one.id, one.name, into.id, into.name, 100 * share)  # fmt: skip
+        self._warn_of_edges()
         for row, o in enumerate(self._scene.objects):
             found = result["objects"][str(o.id)]
             what = f"object {o.id} ({o.name})"

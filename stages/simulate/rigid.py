@@ -35,6 +35,7 @@ from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
+from stages.core.perception.table_outline import TableOutline
 from stages.core.physics.convex_parts import convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, MaterialChoice
@@ -49,8 +50,9 @@ from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
 from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
-from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene, table_of
 from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
+from stages.simulate.table_edges import TableEdges
 
 log = logging.getLogger(__name__)
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
@@ -152,7 +154,8 @@ class _World:
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
         size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (torch.cat(b.parts.hulls) for b in bodies))
         floor = unit * setup.box.low[2]
-        fall = max(float(b.start[2]) - floor for b in bodies)
+        table = table_of(scene, options)
+        fall = max(float(b.start[2]) for b in bodies) - (floor if table is None else unit * table.ground)
         speed = max(float(v.norm()) for v in velocity) + math.sqrt(2 * abs(options.gravity) * max(fall, size))
         mass_of = {o.id: b.mass for o, b in zip(scene.objects, bodies, strict=True)}
         # forces that last less than a frame are impulses, of which live sessions know nothing at the start
@@ -167,7 +170,8 @@ class _World:
         around = background_boxes(scene, setup.box.low[2]) if from_photos(scene) else []
         around = [np.array(corners) * unit / size for corners in around]
         gravity = options.gravity * self.units.time**2 / size
-        self.model = mujoco_model(bodies, self.units, gravity, floor / size, box if options.box else None, around)
+        levels = [floor / size] if table is None else [floor / size, table.ground * unit / size]
+        self.model = mujoco_model(bodies, self.units, gravity, levels, box if options.box else None, around)
         self.data = mujoco.MjData(self.model)
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
         for k, i in enumerate(self._free):
@@ -179,6 +183,7 @@ class _World:
         mujoco.mj_fwdPosition(self.model, self.data)
         self._overlaps = InitialOverlaps(self.model, self.data)
         self._surfaces = self._surface_contacts(setup, options) if any(len(b.parts.hulls) > 1 for b in bodies) else None
+        self._edges = None if table is None else self._table_edges(table)
         self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         self._resting = self._resting_bodies(setup, at_rest)
         self.data.qpos.reshape(-1, FREE)[:, :3] += lift
@@ -239,6 +244,12 @@ class _World:
 
         return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self._bodies))))
 
+    def _table_edges(self, table: TableOutline) -> TableEdges:
+        scale = self._scene.metres_per_unit / self.units.length
+        outline = TableOutline(table.normals, scale * table.offsets, scale * table.ground)
+        corners = [scale * (torch.cat(b.parts.hulls) - b.parts.com).double().numpy() for b in self._bodies]
+        return TableEdges(self._mujoco, self.model, self.data, outline, corners)
+
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
         """`data` has the objects as they are in the photos, without lifts."""
         unit = self._scene.metres_per_unit / self.units.length
@@ -279,24 +290,23 @@ class _World:
     def _step(self) -> None:
         """A substep: mj_step with other reference accelerations of contacts."""
         mujoco, model, data = self._mujoco, self.model, self.data
-        if self._surfaces is None:
-            mujoco.mj_fwdPosition(model, data)
-            count = data.ncon
-        else:
-            for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
-                          mujoco.mj_collision):  # fmt: skip
-                stage(model, data)
-            count = data.ncon
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
+                      mujoco.mj_collision):  # fmt: skip
+            stage(model, data)
+        count = data.ncon
+        if self._surfaces is not None:
             self._surfaces.thin(data, self._overlaps.distances(data))
             self._surfaces.add(data, self._resting.fixed)
-            for stage in (mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint):
-                stage(model, data)
+        if self._edges is not None:
+            self._edges.apply(data, self._resting.fixed)
+        for stage in (mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint):
+            stage(model, data)
         if count:
             self._overlaps.subtract(data, self._resting.fixed, count)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
-        if data.ncon:
+        if data.nefc:
             self._solve(*self._set_references(count))
         else:
             mujoco.mj_fwdConstraint(model, data)

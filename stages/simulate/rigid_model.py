@@ -79,12 +79,12 @@ def damping_ratio(loss: float) -> float:
     return z
 
 
-def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: float, box: Sequence | None,
+def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: Sequence[float], box: Sequence | None,
                  around: Sequence):  # fmt: skip
-    """MuJoCo's model: a body for each object, with a mesh for each convex part or a ball for a round one; a plane for
-    the floor and each wall of `box` (its low and high corner), and the fixed boxes `around`, as pairs of corners; then
-    a body for the ground under each object that is below the floor. `gravity`, the height of the `floor` and the
-    corners are in `units`.
+    """MuJoCo's model: a body for each object, with a mesh for each convex part or a ball for a round one; planes for
+    the `levels`, of which the first is the floor, and each wall of `box` (its low and high corner), and the fixed boxes
+    `around`, as pairs of corners; then a body for the ground under each object that is below the floor. `gravity`, the
+    heights of the levels and the corners are in `units`.
     """
     import mujoco  # noqa: PLC0415 -- slow to import
 
@@ -96,7 +96,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: fl
     if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
     impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
-    planes = [((0.0, 0.0, floor), (0.0, 0.0, 1.0))]
+    planes = [((0.0, 0.0, level), (0.0, 0.0, 1.0)) for level in levels]
     if box:
         planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
                    for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
@@ -110,7 +110,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: fl
     for i, b in enumerate(bodies):
         _add_body(mujoco, spec, f"body{i}", b, units, gravity, impedance)
     for i, b in enumerate(bodies):
-        if b.ground / units.length < floor:
+        if b.ground / units.length < levels[0]:
             ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
             ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **fixed)
             others = [f"body{k}" for k in range(len(bodies)) if k != i]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.perception.table_outline import TableOutline, table_outline
 from stages.core.physics.forces import ForcePrompts, vector
 from stages.core.physics.material_parts import averaged, located, uneven_moments
 from stages.core.physics.materials import MaterialChoice, choose_materials
@@ -165,6 +166,12 @@ def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOpt
     if not bool((points.abs() < LARGEST).all()):
         raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity or "
                          "--force, or another --engine")  # fmt: skip
+
+
+def table_of(scene: Scene, options: SimulateOptions) -> TableOutline | None:
+    """The outline of the table of a scene of photos; None where the floor has no edge, or options place another."""
+    given = options.floor is not None or options.box
+    return None if given or not from_photos(scene) else table_outline(scene)
 
 
 def from_photos(scene: Scene) -> bool:

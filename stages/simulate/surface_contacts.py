@@ -144,7 +144,8 @@ class SurfaceContacts:
             normal = np.concatenate([data.geom_xmat[self._planes[plane]][:, 2::3], normal])
             turn = data.xmat[1 + of].reshape(-1, 3, 3)
             at = turned(turn, self._corners[row]) + data.xpos[1 + of]
-            self._append(data, np.concatenate([at, x]), normal, np.append(depth, excess), one, two)
+            x, depth = np.concatenate([at, x]), np.append(depth, excess)
+            add_contacts(self._mujoco, self._model, data, x, normal, depth, one, two)
 
     def thin(self, data, distance: np.ndarray) -> None:
         """Exclude those of the contacts (k,) of parts that are beside deeper ones, by their distances (k,)."""
@@ -247,24 +248,26 @@ class SurfaceContacts:
         k, plane = np.nonzero(depth > 0)
         return row[k], plane, depth[k, plane]
 
-    def _append(self, data, x, normal, excess, one, two) -> None:
-        """Add contacts at x (k, 3) of geometries (k,), with normals from the first to the second one."""
-        mujoco, model = self._mujoco, self._model
-        contact, before = mujoco.MjContact(), data.ncon
-        contact.dim = 3
-        for name in ("flex", "elem", "vert"):
-            getattr(contact, name)[:] = -1
-        for _ in range(len(x)):
-            mujoco.mj_addContact(model, data, contact)
-        added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer where memory is short
-        x, normal, excess, one, two = x[kept], normal[kept], excess[kept], one[kept], two[kept]
-        added.geom1[new], added.geom2[new], added.geom[new] = one, two, np.stack([one, two], 1)
-        added.dist[new], added.pos[new] = -excess, x
-        added.frame[new] = _frames(normal)
-        # as MuJoCo combines those of two geometries
-        added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
-        added.solref[new] = np.minimum(model.geom_solref[one], model.geom_solref[two])
-        added.solimp[new] = model.geom_solimp[one]
+
+def add_contacts(mujoco, model, data, x, normal, excess, one, two) -> None:
+    """Add contacts at x (k, 3) of geometries (k,), with normals (k, 3) from the first to the second one, which reach
+    into each other by `excess` (k,).
+    """
+    contact, before = mujoco.MjContact(), data.ncon
+    contact.dim = 3
+    for name in ("flex", "elem", "vert"):
+        getattr(contact, name)[:] = -1
+    for _ in range(len(x)):
+        mujoco.mj_addContact(model, data, contact)
+    added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer where memory is short
+    x, normal, excess, one, two = x[kept], normal[kept], excess[kept], one[kept], two[kept]
+    added.geom1[new], added.geom2[new], added.geom[new] = one, two, np.stack([one, two], 1)
+    added.dist[new], added.pos[new] = -excess, x
+    added.frame[new] = _frames(normal)
+    # as MuJoCo combines those of two geometries
+    added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
+    added.solref[new] = np.minimum(model.geom_solref[one], model.geom_solref[two])
+    added.solimp[new] = model.geom_solimp[one]
 
 
 def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

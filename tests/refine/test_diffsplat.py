@@ -13,6 +13,7 @@ from stages.core.geometry.harmonics import C0
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.models.diffsplat.maps import FOCAL, RADIUS, SCALES, cameras, to_gaussians
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene, SceneObject
@@ -22,7 +23,6 @@ from stages.lab.assets.shapes import ellipsoid
 from stages.refine import diffsplat
 from stages.refine.library import opaque_gaussians, transformed
 from stages.refine.object_crop import crop_object
-from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 from stages.refine.registration import register
 from stages.refine.registration_cloud import RegistrationCloud

@@ -11,6 +11,7 @@ from stages.core.geometry.cameras import centres, intrinsics, look_at
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
+from stages.core.perception.observed_space import ObservedSpace
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
@@ -18,7 +19,6 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine.library import transformed
-from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine, run
 from tests.conftest import random_gaussians

@@ -11,6 +11,7 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
+from stages.core.perception.observed_space import ObservedSpace, object_psnr
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import concatenate, transformed
@@ -19,7 +20,6 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.lab.assets.shapes import ellipsoid, sheet
 from stages.refine import inpaint
 from stages.refine.disc_gaussians import disc_gaussians
-from stages.refine.observed_space import ObservedSpace, object_psnr
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.stage import refine, run

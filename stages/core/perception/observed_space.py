@@ -52,19 +52,19 @@ class ObservedSpace:
         With MIN_VIEWS_FOR_TWO cameras or more two must agree, since a floater may corrupt one depth map.
         """
         count = torch.zeros(len(points), dtype=torch.int64)
-        for inside, z, depth in self._depths(points):
+        for inside, z, depth in self.surface_depths(points):
             count[inside] += (z < depth - margin).long()
         return count >= (2 if len(self.views) >= MIN_VIEWS_FOR_TWO else 1)
 
     def visible_fraction(self, points: Float[Tensor, "n 3"], margin: float) -> Float[Tensor, "n"]:
         """Fraction of the cameras with a point in their image that see it: no surface is `margin` in front of it."""
         seen, framed = torch.zeros(len(points)), torch.zeros(len(points))
-        for inside, z, depth in self._depths(points):
+        for inside, z, depth in self.surface_depths(points):
             framed += inside
             seen[inside] += (depth > z - margin).float()
         return seen / framed.clamp_min(1)
 
-    def _depths(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[Bool[Tensor, "n"], Tensor, Tensor]]:
+    def surface_depths(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[Bool[Tensor, "n"], Tensor, Tensor]]:
         """For each view: which points are in its image, their depths, and the depths of the surface there."""
         for (viewmat, K, width, height), depth in zip(self.views, self.depth, strict=True):
             z = depths(points, viewmat)

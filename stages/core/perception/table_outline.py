@@ -1,0 +1,113 @@
+"""The outline of the table that objects stand on: where cameras look past its edge, at what lies below.
+
+Where no camera does, as where the photos end, the table goes on. The outline is convex: half-planes through the edges,
+in DIRECTIONS directions, so that a notch in a table counts as table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from stages.core.geometry.cameras import centres
+from stages.core.perception.observed_space import FAR, ObservedSpace
+from stages.core.perception.support import Support, find_support
+from stages.core.scene.cached import cached_in_scene
+from stages.core.scene.scene import Scene
+
+# The five below were chosen on kitchen, kermit, the desk and banana, whose carpet has no edge [camera distances].
+MIN_DROP = 0.05  # from the table to what is seen past it, along the ray
+MIN_VIEWS = 3  # that know a cell
+STRIP, GAP, NEAR = 0.1, 0.01, 0.03  # width of the strip beyond an edge, its distance, and depth of the edge itself
+MIN_SEEN_PAST = 0.8  # of the known cells in the strip beyond an edge
+MIN_KNOWN = 0.25  # of the strip
+
+MIN_SHARE = 0.5  # of the views that know a cell must look past it
+DIRECTIONS = 72
+LOWEST = 0.1  # quantile of the heights seen past the table, at which the ground is; below are errors of few views
+
+
+@dataclass(frozen=True)
+class TableOutline:
+    """A convex region of the plane, the intersection of half-planes, and the ground beyond it, in scene units."""
+
+    normals: Float[np.ndarray, "k 2"]  # outwards
+    offsets: Float[np.ndarray, "k"]  # normals @ xy <= offsets on the table
+    ground: float  # height of the lowest that cameras see past the table
+
+    def beyond(self, xy: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+        """How far points are beyond the edge; negative on the table."""
+        return (xy[:, :2] @ self.normals.T - self.offsets).max(1)
+
+
+@cached_in_scene
+def table_outline(scene: Scene) -> TableOutline | None:
+    """The outline of the table at the scene's floor; None where no edge is known, as without cameras."""
+    if scene.floor is None or scene.cameras is None or len(scene.cameras) < MIN_VIEWS:
+        return None
+    support = find_support(scene)
+    if support is None:
+        return None
+    past, known, heights = _seen_past(support, ObservedSpace.of(scene))
+    table = ndimage.binary_opening(support.region.numpy() & ~past, iterations=2)
+    parts, count = ndimage.label(table)
+    if not count:
+        return None
+    largest = parts == 1 + np.argmax(np.bincount(parts[table])[1:])
+    edges = _edges(np.argwhere(largest), past, known, support.view.radius / support.cell)
+    if not edges or not len(heights):
+        return None
+    normals, offsets = (np.array(each) for each in zip(*edges, strict=True))
+    origin = support.view.focus[:2].double().numpy() - support.cell * (len(past) - 1) / 2  # of the first cell
+    return TableOutline(normals, offsets * support.cell + normals @ origin, float(np.quantile(heights, LOWEST)))
+
+
+def _seen_past(
+    support: Support, observed: ObservedSpace
+) -> tuple[Bool[np.ndarray, "g g"], Bool[np.ndarray, "g g"], Float[np.ndarray, "h"]]:
+    """The cells of the support's grid past which most views look, those that enough views know, and the heights of the
+    surfaces that are seen past the former [scene units].
+    """
+    side, drop = len(support.region), MIN_DROP * support.view.radius
+    along = (torch.arange(side) + 0.5 - side / 2) * support.cell
+    xy = torch.stack(torch.meshgrid(along, along, indexing="ij"), -1).flatten(0, 1) + support.view.focus[:2]
+    cells = torch.cat([xy, support.surface(xy)[:, None]], 1)
+    past, known = (torch.zeros(len(cells), dtype=torch.int64) for _ in range(2))
+    seen = []
+    for (viewmat, *_), (inside, z, depth) in zip(observed.views, observed.surface_depths(cells), strict=True):
+        sees = (depth > z - drop) & (depth < FAR)
+        beyond = sees & (depth > z + drop)
+        known[inside] += sees
+        past[inside] += beyond
+        eye, row = centres(viewmat[None])[0], inside.nonzero()[:, 0][beyond]
+        seen.append((row, eye[2] + (cells[row, 2] - eye[2]) * (depth / z)[beyond]))
+    enough = known >= MIN_VIEWS
+    through = enough & (past > MIN_SHARE * known)
+    heights = torch.cat([height[through[row]] for row, height in seen])
+    return through.view(side, side).numpy(), enough.view(side, side).numpy(), heights.numpy()
+
+
+def _edges(
+    table: np.ndarray, past: np.ndarray, known: np.ndarray, unit: float
+) -> list[tuple[Float[np.ndarray, "2"], float]]:
+    """Outward normals and offsets of the edges of the cells `table` (m, 2), in cells; `unit` is one camera distance."""
+    edges = []
+    for angle in np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False):
+        normal = np.array([np.cos(angle), np.sin(angle)])
+        along = np.array([-normal[1], normal[0]])
+        height = table @ normal
+        end = np.quantile(height, 0.995)
+        edge = table[height > end - NEAR * unit] @ along
+        t, h = np.meshgrid(
+            np.arange(edge.min(), edge.max() + 1), np.arange(end + GAP * unit, end + (GAP + STRIP) * unit)
+        )
+        strip = np.round(t[..., None] * along + h[..., None] * normal).astype(np.int64).reshape(-1, 2)
+        strip = strip[((strip >= 0) & (strip < len(past))).all(1)]
+        is_known, is_past = (mask[tuple(strip.T)] for mask in (known, past))
+        if len(strip) and is_known.mean() > MIN_KNOWN and is_past.sum() > MIN_SEEN_PAST * is_known.sum():
+            edges.append((normal, float(end)))
+    return edges

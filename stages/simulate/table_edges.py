@@ -1,0 +1,86 @@
+"""The edges of the table in the rigid engine: its floor, an infinite plane, supports only what is over the table.
+
+Contacts with the floor beyond an edge are excluded. Where a body reaches over an edge, its convex hull is cut by the
+vertical plane through the edge, and what of the cut is below the floor touches it. A body whose centre is beyond an
+edge and below the floor has left the table, which it then no longer touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from stages.core.perception.table_outline import TableOutline
+from stages.simulate.surface_contacts import add_contacts
+
+ON_EDGE = 1e-9  # of the other edges, up to which a point is on the table [units of the simulation]
+
+
+class TableEdges:
+    """Changes the contacts of the bodies 1.. of a MuJoCo model with the floor, its first geometry."""
+
+    def __init__(self, mujoco, model, data, outline: TableOutline, corners: Sequence[np.ndarray]):
+        """`outline` is in units of the simulation; `corners` (v, 3) of each body are in its frame."""
+        self._mujoco, self._model, self._outline = mujoco, model, outline
+        self._hulls = [_hull_edges(points) for points in corners]
+        self._radius = np.array([np.linalg.norm(points, axis=1).max(initial=0) for points in corners])
+        self._geom = [np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(len(corners))]
+        self._floor = float(model.geom_pos[0, 2])
+        self._left = np.zeros(model.nbody, bool)
+        lowest = [self._world(data, i)[..., 2].min() for i in range(len(corners))]
+        self._sunk = np.maximum(self._floor - np.array(lowest), 0)  # which is no contact
+        signature = (model.geom_bodyid[0] << 16) + np.arange(1, len(corners) + 1)
+        self._on_table = ~np.isin(signature, model.exclude_signature)
+
+    def apply(self, data, fixed: np.ndarray) -> None:
+        """After all contacts were found: exclude and add some; `fixed` masks the bodies that do not move."""
+        count = len(self._radius)
+        centre = data.xpos[1 : count + 1]
+        beyond = self._outline.beyond(centre)
+        self._left[1 : count + 1] |= (beyond > 0) & (centre[:, 2] < self._floor)
+        contact = data.contact
+        rows = np.flatnonzero((contact.geom == 0).any(1))
+        body = self._model.geom_bodyid[contact.geom[rows]].max(1)
+        rows = rows[self._left[body] | (self._outline.beyond(contact.pos[rows]) > 0)]
+        contact.exclude[rows] = 1
+        contact.efc_address[rows] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        over = self._on_table & ~self._left[1 : count + 1] & ~fixed[1 : count + 1]
+        over &= (np.abs(beyond) < self._radius) & (centre[:, 2] - self._floor < self._radius)
+        found = [(i, x) for i in np.flatnonzero(over) for x in self._on_edges(self._world(data, i), self._sunk[i])]
+        if not found:
+            return
+        i, x = np.array([i for i, _ in found]), np.array([x for _, x in found])
+        depth = self._floor - x[:, 2] - self._sunk[i]
+        up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+        add_contacts(self._mujoco, self._model, data, x, up, depth, np.zeros(len(x), int), np.array(self._geom)[i])
+
+    def _world(self, data, row: int) -> np.ndarray:
+        """Ends (e, 2, 3) of the edges of a body's hull."""
+        return self._hulls[row] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
+
+    def _on_edges(self, ends: np.ndarray, sunk: float) -> list[np.ndarray]:
+        """Of the points where edges (e, 2, 3) cross those of the table and are deeper than `sunk`, the outer ones."""
+        found = []
+        side = ends[..., :2] @ self._outline.normals.T - self._outline.offsets  # (e, 2, k)
+        for k in np.flatnonzero((side < 0).any((0, 1)) & (side > 0).any((0, 1))):
+            crossing = side[:, 0, k] * side[:, 1, k] < 0
+            a, b = side[crossing, :, k].T
+            x = ends[crossing, 0] + (a / (a - b))[:, None] * (ends[crossing, 1] - ends[crossing, 0])
+            x = x[(x[:, 2] < self._floor - sunk) & (self._outline.beyond(x) < ON_EDGE)]
+            if len(x):
+                normal = self._outline.normals[k]
+                along = x[:, :2] @ [-normal[1], normal[0]]
+                found += [x[row] for row in {int(along.argmin()), int(along.argmax()), int(x[:, 2].argmin())}]
+        return found
+
+
+def _hull_edges(points: np.ndarray) -> np.ndarray:
+    """Ends (e, 2, 3) of the edges of the triangulated convex hull of points; none of points in a plane."""
+    try:
+        triangles = ConvexHull(points).simplices
+    except (QhullError, ValueError):
+        return np.zeros((0, 2, 3))
+    pairs = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1), axis=0)
+    return points[pairs]

@@ -1,0 +1,36 @@
+"""The outline of a table: where cameras see the ground past its edges."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stages.core.perception.table_outline import table_outline
+from tests.tables import GROUND, HIGH, LOW, table_scene
+
+
+def test_the_edges_of_a_table_are_where_the_ground_is_seen():
+    outline = table_outline(table_scene())
+    along = np.linspace(-1, 1, 21)
+    for half, axis in ((HIGH[0], 0), (HIGH[1], 1)):
+        for side in (-1, 1):
+            other = 0.8 * along * (HIGH[0] + HIGH[1] - half)
+            at = np.stack([other, other], 1)
+            at[:, axis] = side * half
+            # a cell is .013, the pixels of the depth maps about as large
+            np.testing.assert_allclose(outline.beyond(at), 0, atol=0.03)
+    assert GROUND - 0.01 < outline.ground < GROUND + 0.04  # depth maps take the nearest of 3 x 3 pixels
+
+
+def test_a_table_that_fills_the_photos_has_no_edge():
+    assert table_outline(table_scene(low=(-2, -2), high=(2, 2))) is None
+
+
+def test_where_no_camera_sees_the_ground_the_table_goes_on():
+    outline = table_outline(table_scene(low=(LOW[0], LOW[1]), high=(2.0, HIGH[1])))
+    there = np.array([[1.5, 0.0], [4.0, 0.0], [-0.5, 0.0], [0.0, 0.4]])
+    assert ((outline.beyond(there) > 0) == [False, False, True, True]).all()
+
+
+def test_nothing_under_the_table_and_no_cameras_give_no_edge():
+    assert table_outline(table_scene(ground=None)) is None
+    assert table_outline(replace(table_scene(), cameras=None)) is None

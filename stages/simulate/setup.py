@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.perception.table_outline import TableOutline, table_outline
 from stages.core.physics.forces import ForcePrompts, vector
@@ -171,7 +172,7 @@ def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOpt
 def table_of(scene: Scene, options: SimulateOptions) -> TableOutline | None:
     """The outline of the table of a scene of photos; None where the floor has no edge, or options place another."""
     given = options.floor is not None or options.box
-    return None if given or not from_photos(scene) else table_outline(scene)
+    return None if given or not from_photos(scene) else table_outline(scene, str(pick_device(options.device)))
 
 
 def from_photos(scene: Scene) -> bool:

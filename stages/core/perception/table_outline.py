@@ -45,14 +45,17 @@ class TableOutline:
 
 
 @cached_in_scene
-def table_outline(scene: Scene) -> TableOutline | None:
-    """The outline of the table at the scene's floor; None where no edge is known, as without cameras."""
+def table_outline(scene: Scene, device: str = "cpu") -> TableOutline | None:
+    """The outline of the table at the scene's floor; None where no edge is known, as without cameras.
+
+    `device` renders the depth maps.
+    """
     if scene.floor is None or scene.cameras is None or len(scene.cameras) < MIN_VIEWS:
         return None
     support = find_support(scene)
     if support is None:
         return None
-    past, known, heights = _seen_past(support, ObservedSpace.of(scene))
+    past, known, heights = _seen_past(support, ObservedSpace.of(scene, device))
     table = ndimage.binary_opening(support.region.numpy() & ~past, iterations=2)
     parts, count = ndimage.label(table)
     if not count:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from stages.core.scene.files import ngff_version
 from stages.refine.options import BACKENDS as COMPLETERS
+from stages.refine.options import UPSCALERS
 from stages.segment.options import BACKENDS as SEGMENTERS
 
 TABLE_WIDTH, SUBJECT_WIDTH = 100, 18  # columns
@@ -139,6 +140,9 @@ def _published_weights() -> Iterator[Finding]:
     yield _weights("aliked-lightglue", lambda: [find() for find in matchers][0], remedy)
     for user, (name, row) in NETWORKS.items():
         yield _weights(name, load(row.find_weights), f"ngff {user} --download")
+    for name, row in UPSCALERS.items():
+        if row.find_weights:  # not by --download; the command says where they are
+            yield _weights(name, load(row.find_weights), f"ngff refine --completer diffsplat --upscale {name}")
 
 
 def _weights(name: str, find: Callable[[], Path], remedy: str) -> Finding:

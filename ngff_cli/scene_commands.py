@@ -11,7 +11,7 @@ from stages.reconstruct.options import BACKENDS as RECONSTRUCT
 from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
 from stages.reconstruct.options import SYNCHRONISATIONS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
-from stages.refine.options import GENERATORS, RefineOptions
+from stages.refine.options import GENERATORS, UPSCALERS, RefineOptions
 from stages.refine.options import MATCHERS as REFINE_MATCHERS
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import NETWORKS, SegmentOptions
@@ -181,6 +181,9 @@ def refine(
     download: Annotated[
         bool, Option("--download", help=f"for {GENERATORS}: download missing weights, after logging size and licence")
     ] = RefineOptions.download,
+    upscale: Annotated[
+        str, Option(help=f"for {GENERATORS}, super-resolution of the object's image; {describe(UPSCALERS)}")
+    ] = RefineOptions.upscale,
     matcher: Annotated[
         str, Option(help=f"to register whole objects, by a photo and renderings: {' | '.join(REFINE_MATCHERS)}")
     ] = RefineOptions.matcher,
@@ -199,7 +202,8 @@ def refine(
 ) -> None:
     """Complete the objects and fill the table beneath them: LABELLED.ply -> REFINED.ply."""
     options = RefineOptions(
-        completer=completer, library=library, photos=photos, weights=weights, download=download, matcher=matcher,
-        keep_raw=keep_raw, outliers=outliers, background=background, resolution=resolution, seed=seed, device=device,
+        completer=completer, library=library, photos=photos, weights=weights, download=download, upscale=upscale,
+        matcher=matcher, keep_raw=keep_raw, outliers=outliers, background=background, resolution=resolution, seed=seed,
+        device=device,
     )  # fmt: skip
     load("stages.refine.stage:run")(scene, out, options)

@@ -10,7 +10,7 @@ import logging
 from functools import lru_cache
 from pathlib import Path
 
-from stages.core.backends import pick_device
+from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.models.diffsplat.weights import Files, find, load
 from stages.core.perception.observed_space import ObservedSpace
@@ -20,8 +20,9 @@ from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import empty_like
 from stages.refine.library import matched_hints, opaque_gaussians, place_whole
 from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
-from stages.refine.options import RefineOptions
+from stages.refine.options import UPSCALERS, RefineOptions
 from stages.refine.registration import MIN_REGISTRATION_POINTS, register
+from stages.refine.upscale import SIDE, upscaled
 
 log = logging.getLogger(__name__)
 MIN_FIT = 0.5  # below it, another object; true output maps reach 0.95, those of random weights 0.01
@@ -32,9 +33,11 @@ def complete(
 ) -> Gaussians:
     """The completer "diffsplat": Gaussians of the generated object where it was not seen, if it fits."""
     device = pick_device(options.device)
+    upscaler = choose(UPSCALERS, options.upscale)(options)
     model = _model(options.weights, options.download, device)
     own, name = opaque_gaussians(scene, number), scene.name_of(number)
-    crop = crop_object(scene, own, model.side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
+    side = SIDE if upscaler else model.side
+    crop = crop_object(scene, own, side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
     if crop is None:
         log.info("  %d  %s: unchanged: no photo shows enough of it", number, name)
         return empty_like(own)
@@ -42,6 +45,9 @@ def complete(
         log.info("  %d  %s: seen from %.0f degrees above in %s; outside the %.0f to %.0f that DiffSplat was trained on",
                  number, name, crop.elevation, crop.name, *TRAINED_ELEVATIONS)  # fmt: skip
     prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
+    if upscaler:
+        crop = upscaled(crop, upscaler, model.side, prompt, options.seed)
+        log.info("  %d  %s: image of %s restored by %s at %d pixels", number, name, crop.name, options.upscale, SIDE)
     generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
     generated = generated[generated.opacities > SURFACE_OPACITY]
     hints = [crop.place, *matched_hints(options, crop, own, generated)]

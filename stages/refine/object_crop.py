@@ -40,6 +40,7 @@ class ObjectCrop:
     name: str  # of the photo
     viewmat: Float[Tensor, "4 4"]  # of the camera, and its intrinsics
     K: Float[Tensor, "3 3"]
+    coverage: Float[Tensor, "s s"]  # of each pixel by the object, 0..1; the rest is white
 
 
 def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = None) -> ObjectCrop | None:
@@ -61,12 +62,13 @@ def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = N
         photo = read_image(files[view])
         photo = Undistortion.of(scene.cameras, view, (photo.shape[1], photo.shape[0])).image(photo)
         image = _rotated_photo(photo, scene, view, viewmat, K, side)
-    alone = _mask(scene.gaussians, own, viewmat, K, side)[..., None]
+    coverage = _mask(scene.gaussians, own, viewmat, K, side)
+    alone = coverage[..., None]
     eye = centres(viewmat[None])[0]
     elevation = _elevation(eye, centre)
     scale = float((eye - centre).norm()) * FOCAL * side / float(K[0, 0]) / RADIUS
     place = Similarity(scale, viewmat[:3, :3].mT @ cameras(elevation)[0, :3, :3], centre)
-    return ObjectCrop(image * alone + 1 - alone, elevation, place, scene.cameras.names[view], viewmat, K)
+    return ObjectCrop(image * alone + 1 - alone, elevation, place, scene.cameras.names[view], viewmat, K, coverage)
 
 
 def _files(photos: Path, scene: Scene) -> dict[int, Path]:

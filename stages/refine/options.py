@@ -19,6 +19,14 @@ BACKENDS = {
     "none": Backend("stages.refine.hull_completion:no_completion", "add nothing to objects"),
 }  # fmt: skip
 GENERATORS = with_weights(BACKENDS)
+# an upscaler takes RefineOptions and returns a network whose `restore(image, prompt, seed)` adds detail, or None
+UPSCALERS = {
+    "none": Backend("stages.refine.upscale:no_upscaler", "the photo's pixels"),
+    "osediff": Backend(
+        "stages.refine.upscale:osediff", "detail added by OSEDiff at 768 pixels",
+        find_weights="stages.refine.upscale:weights_file", package="diffusers", extra="diffsplat",
+    ),
+}  # fmt: skip
 MATCHERS = ("none", "aliked-lightglue")
 WHOLE_OBJECTS = ("library", "diffsplat")  # completers that register a whole object
 CONCURRENT = {"close", "none"}  # completers of which several run at a time: they use the CPU alone
@@ -33,6 +41,7 @@ class RefineOptions:
     photos: Path | None = None  # folder of the scene's photos, for generators; by default the scene is rendered
     weights: Path | None = None  # folder of a generator's weights; by default searched
     download: bool = False  # download missing weights
+    upscale: str = "none"  # of UPSCALERS: super-resolution of the image that DiffSplat gets
     matcher: str = "none"  # of MATCHERS: poses of whole objects also by learned matches of images
     keep_raw: bool = False  # of K objects, keep the uncompleted ones as K + 1 to 2 K
     outliers: float = 3.0  # robust deviations beyond which a Gaussian is a floater; 0 keeps all
@@ -48,6 +57,10 @@ class RefineOptions:
             raise InputError(
                 f"--photos, --weights and --download only work with --completer {GENERATORS}; add it or drop them"
             )
+        if self.upscale not in UPSCALERS:
+            raise InputError(f"--upscale {self.upscale}: choose from {', '.join(UPSCALERS)}")
+        if self.upscale != "none" and not self._is_generator:
+            raise InputError(f"--upscale: only works with --completer {GENERATORS}; add it or drop it")
         if self.matcher not in MATCHERS:
             raise InputError(f"--matcher {self.matcher}: choose from {', '.join(MATCHERS)}")
         if self.matcher != "none" and self.chosen not in WHOLE_OBJECTS:

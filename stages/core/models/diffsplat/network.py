@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.models.diffsplat.maps import AZIMUTHS, cameras, plucker, to_gaussians
+from stages.core.models.stable_diffusion import encode_prompts
 from stages.core.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class DiffSplat:
         Noise is drawn on the CPU, so that a seed gives the same noise on every device.
         """
         device = self.unet.device
-        text = self._text([NEGATIVE, prompt]).repeat_interleave(VIEWS + 1, 0)
+        text = encode_prompts(self.tokenizer, self.text_encoder, [NEGATIVE, prompt]).repeat_interleave(VIEWS + 1, 0)
         latent = self._image_latent(image.to(device))
         guidance = triangle(*GUIDANCE).to(device)[:, None, None, None]
         generator = torch.Generator().manual_seed(seed)
@@ -115,12 +116,6 @@ class DiffSplat:
         flags = torch.ones(VIEWS + 1, 1, side, side).to(rays)
         flags[0] = 0
         return torch.cat([torch.cat([rays[:1], rays]), flags], 1)
-
-    def _text(self, prompts: list[str]) -> Float[Tensor, "b n d"]:
-        """Last hidden states of the text encoder, of prompts cut or padded to its length."""
-        length = self.text_encoder.config.max_position_embeddings
-        tokens = self.tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
-        return self.text_encoder(tokens.input_ids.to(self.unet.device))[0]
 
     def _image_latent(self, image: Float[Tensor, "s s 3"]) -> Float[Tensor, "1 4 z z"]:
         """Latent of the image: the encoder's mean, scaled."""

@@ -26,6 +26,7 @@ from stages.core.errors import InputError
 from stages.core.models.diffsplat.maps import CHANNELS
 from stages.core.models.hub import HubSource, folders
 from stages.core.models.pi3.weights import differences, read_state
+from stages.core.models.stable_diffusion import read_parts
 
 if TYPE_CHECKING:
     from stages.core.models.diffsplat.network import DiffSplat
@@ -104,44 +105,16 @@ def load(files: Files, device: str = "cpu") -> DiffSplat:
 
     Raises InputError for missing packages and for files that are damaged or of another model.
     """
-    try:
-        import diffusers
-        import transformers
-    except ImportError as error:
-        raise InputError(
-            "diffsplat: needs the packages diffusers and transformers (`pip install 'ngff[diffsplat]'`)"
-        ) from error
     from stages.core.models.diffsplat.network import DiffSplat, share_attention
 
-    transformers.utils.logging.disable_progress_bar()
-    half = (files.base / "text_encoder/model.fp16.safetensors").exists()
-    try:
-        text = _from_folder(transformers.CLIPTextModel, files.base / "text_encoder", variant="fp16" if half else None,
-                      dtype=torch.float32)  # fmt: skip
-        vae = _from_folder(diffusers.AutoencoderKL, files.base / "vae", low_cpu_mem_usage=False)
-        tokenizer = transformers.CLIPTokenizer.from_pretrained(files.base / "tokenizer", local_files_only=True)
-        scheduler = sampler(json.loads((files.base / "scheduler/scheduler_config.json").read_text()))
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
-        raise InputError(
-            f"{files.base}: cannot be read as Stable Diffusion 1.5 ({' '.join(str(error).split())[:160]}); fetch its "
-            f"{', '.join(PARTS)} from https://huggingface.co/{SOURCES[1].repository} again"
-        ) from error
+    parts = read_parts(files.base, PARTS, sampler, "diffsplat", "Stable Diffusion 1.5", SOURCES[1])
+    text, vae = parts["text_encoder"], parts["vae"]
     gsvae = filled(gaussian_vae(dict(vae.config)), files.gsvae, "vae.", ("tiny_decoder.",))
     unet = filled(_unet(files.unet / "config.json"), files.unet / "diffusion_pytorch_model.safetensors")
     share_attention(unet)
     for part in (text, vae, unet, gsvae):
         part.requires_grad_(False).eval().to(device)
-    return DiffSplat(tokenizer, text, vae, unet, gsvae, scheduler)
-
-
-def _from_folder(kind: type, folder: Path, **how) -> nn.Module:
-    """A library's model from its folder; ValueError for missing tensors (the library would fill in random ones)."""
-    model, found = kind.from_pretrained(
-        folder, local_files_only=True, use_safetensors=True, output_loading_info=True, **how
-    )
-    if lack := sorted(found["missing_keys"]):
-        raise ValueError(f"{folder.name} lacks {len(lack)} tensors such as {lack[0]}")
-    return model
+    return DiffSplat(parts["tokenizer"], text, vae, unet, gsvae, parts["scheduler"])
 
 
 def sampler(config: dict):

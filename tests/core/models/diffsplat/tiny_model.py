@@ -30,33 +30,32 @@ UNET_CONFIG = {
 }  # fmt: skip
 
 
-def unet() -> UNet2DConditionModel:
+def unet(in_channels: int = 11, **more) -> UNet2DConditionModel:
     """The U-Net that UNET_CONFIG describes, built directly."""
     from diffusers import UNet2DConditionModel
 
     torch.manual_seed(0)
     return UNet2DConditionModel(
-        sample_size=SIDE // 2, in_channels=11, out_channels=4, block_out_channels=WIDTHS, layers_per_block=1,
+        sample_size=SIDE // 2, in_channels=in_channels, out_channels=4, block_out_channels=WIDTHS, layers_per_block=1,
         norm_num_groups=4, down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
-        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"), cross_attention_dim=16, attention_head_dim=2,
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"), cross_attention_dim=16, attention_head_dim=2, **more,
     )  # fmt: skip
 
 
-def autoencoder(channels: int) -> AutoencoderKL:
+def autoencoder(channels: int, widths: tuple[int, ...] = WIDTHS) -> AutoencoderKL:
     """Small autoencoder of `channels` channels with random weights."""
     from diffusers import AutoencoderKL
 
     torch.manual_seed(channels)
     return AutoencoderKL(
-        in_channels=channels, out_channels=channels, down_block_types=("DownEncoderBlock2D",) * 2, layers_per_block=1,
-        up_block_types=("UpDecoderBlock2D",) * 2, block_out_channels=WIDTHS, norm_num_groups=4, latent_channels=4,
+        in_channels=channels, out_channels=channels, layers_per_block=1, block_out_channels=widths,
+        down_block_types=("DownEncoderBlock2D",) * len(widths), up_block_types=("UpDecoderBlock2D",) * len(widths),
+        norm_num_groups=4, latent_channels=4,
     )  # fmt: skip
 
 
 def save_tiny_model(folder: Path) -> Path:
     """Write U-Net, Gaussian autoencoder and Stable Diffusion parts into a folder."""
-    from transformers import CLIPTextConfig, CLIPTextModel
-
     ema = folder / UNET / "checkpoints/013020/unet_ema"
     ema.mkdir(parents=True)
     (ema / "config.json").write_text(json.dumps(UNET_CONFIG))
@@ -65,8 +64,14 @@ def save_tiny_model(folder: Path) -> Path:
     steps.mkdir(parents=True)
     state = {f"vae.{k}": v for k, v in autoencoder(12).state_dict().items()}
     save_file({**state, "tiny_decoder.layers.0.weight": torch.zeros(3)}, steps / "model.safetensors")
-    base = folder / BASE
-    vae = autoencoder(3)
+    save_stable_diffusion(folder / BASE, autoencoder(3))
+    return folder
+
+
+def save_stable_diffusion(base: Path, vae: AutoencoderKL) -> None:
+    """Write tokenizer, text encoder, autoencoder and scheduler."""
+    from transformers import CLIPTextConfig, CLIPTextModel
+
     vae.save_config(base / "vae")
     save_file(legacy_names(vae.state_dict()), base / "vae/diffusion_pytorch_model.safetensors")
     torch.manual_seed(3)
@@ -80,7 +85,6 @@ def save_tiny_model(folder: Path) -> Path:
     (base / "scheduler").mkdir()
     (base / "scheduler/scheduler_config.json").write_text(json.dumps(SCHEDULER))
     _tokenizer(base / "tokenizer")
-    return folder
 
 
 def legacy_names(state: dict) -> dict:

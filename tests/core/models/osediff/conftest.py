@@ -1,0 +1,24 @@
+"""One tiny model for all tests of this folder, saved and loaded like the published one."""
+
+from importlib.util import find_spec
+
+import pytest
+
+# not imported, which takes seconds: every worker collects these tests
+if not (find_spec("diffusers") and find_spec("transformers")):
+    pytest.skip("needs the extra diffsplat", allow_module_level=True)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """Stands for $NGFF_WEIGHTS."""
+    from tests.core.models.osediff.tiny_model import save_tiny_osediff
+
+    return save_tiny_osediff(tmp_path_factory.mktemp("osediff_weights"))
+
+
+@pytest.fixture(scope="module")
+def model(folder, device):
+    from stages.core.models.osediff.weights import find, load
+
+    return load(find(folder), device)

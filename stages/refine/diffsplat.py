@@ -22,7 +22,7 @@ from stages.refine.library import matched_hints, opaque_gaussians, place_whole
 from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
 from stages.refine.options import UPSCALERS, RefineOptions
 from stages.refine.registration import MIN_REGISTRATION_POINTS, register
-from stages.refine.upscale import SIDE, upscaled
+from stages.refine.upscale import RESTORED_SIDE, upscaled
 
 log = logging.getLogger(__name__)
 MIN_FIT = 0.5  # below it, another object; true output maps reach 0.95, those of random weights 0.01
@@ -36,7 +36,7 @@ def complete(
     upscaler = choose(UPSCALERS, options.upscale)(options)
     model = _model(options.weights, options.download, device)
     own, name = opaque_gaussians(scene, number), scene.name_of(number)
-    side = SIDE if upscaler else model.side
+    side = RESTORED_SIDE if upscaler else model.side
     crop = crop_object(scene, own, side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
     if crop is None:
         log.info("  %d  %s: unchanged: no photo shows enough of it", number, name)
@@ -47,7 +47,7 @@ def complete(
     prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
     if upscaler:
         crop = upscaled(crop, upscaler, model.side, prompt, options.seed)
-        log.info("  %d  %s: image of %s restored by %s at %d pixels", number, name, crop.name, options.upscale, SIDE)
+        log.info("  %d  %s: image of %s restored by %s at %d pixels", number, name, crop.name, options.upscale, side)
     generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
     generated = generated[generated.opacities > SURFACE_OPACITY]
     hints = [crop.place, *matched_hints(options, crop, own, generated)]

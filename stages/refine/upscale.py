@@ -15,7 +15,7 @@ from stages.core.models.osediff.weights import find, load
 from stages.refine.object_crop import ObjectCrop
 from stages.refine.options import RefineOptions
 
-SIDE = 768  # of the image that is restored [px], as in the paper
+RESTORED_SIDE = 768  # of the image that is restored [px], as in the paper
 
 
 def no_upscaler(options: RefineOptions) -> None:

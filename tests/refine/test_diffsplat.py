@@ -129,23 +129,36 @@ def test_missing_weights_are_reported(seen, tmp_path, monkeypatch):
     write_scene(tmp_path / "scene.ply", seen)
     with pytest.raises(InputError, match="chenguolin/DiffSplat"):
         run(tmp_path / "scene.ply", tmp_path / "out.ply", RefineOptions(completer="diffsplat"))
+    with pytest.raises(InputError, match="cswry/OSEDiff"):
+        run(tmp_path / "scene.ply", tmp_path / "out.ply", RefineOptions(completer="diffsplat", upscale="osediff"))
     assert not (tmp_path / "out.ply").exists()
     with pytest.raises(InputError, match="--completer diffsplat"):
         RefineOptions(photos=tmp_path)
 
 
+def test_upscaling_needs_the_generator():
+    with pytest.raises(InputError, match="--upscale: only works with --completer diffsplat"):
+        RefineOptions(upscale="osediff")
+    with pytest.raises(InputError, match="--upscale x2: choose from none, osediff"):
+        RefineOptions(completer="diffsplat", upscale="x2")
+
+
 def test_output_of_random_weights_is_rejected(seen, tmp_path, caplog, monkeypatch):
-    """Random weights in the published layout, through the loader, a sampler with fewer steps, and registration."""
+    """Random weights in the published layouts, through both loaders, OSEDiff, a sampler with fewer steps, and fits."""
     pytest.importorskip("diffusers")
     pytest.importorskip("transformers")
     from stages.core.models.diffsplat import network
     from tests.core.models.diffsplat.tiny_model import save_tiny_model
+    from tests.core.models.osediff.tiny_model import save_tiny_osediff
 
     monkeypatch.setattr(network, "STEPS", 3)
+    monkeypatch.setattr(diffsplat, "RESTORED_SIDE", 100)
     write_scene(tmp_path / "scene.ply", seen)
     with caplog.at_level(logging.INFO):
-        options = RefineOptions(completer="diffsplat", weights=save_tiny_model(tmp_path / "weights"), background=False)
+        weights = save_tiny_osediff(save_tiny_model(tmp_path / "weights"))
+        options = RefineOptions(completer="diffsplat", upscale="osediff", weights=weights, background=False)
         run(tmp_path / "scene.ply", tmp_path / "out.ply", options)
+    assert "restored by osediff at 100 pixels" in caplog.text
     assert "unchanged" in caplog.text and "the object generated from" in caplog.text
     before, after = (int((s.gaussians.object_id == 1).sum()) for s in (seen, read_scene(tmp_path / "out.ply")))
     assert after <= before

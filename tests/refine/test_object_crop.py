@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from stages.core.scene.images import read_image, write_png
 from stages.core.scene.scene import Scene, SceneObject
 from stages.refine.library import opaque_gaussians, transformed
 from stages.refine.object_crop import CROP_FILL, crop_object
+from stages.refine.upscale import upscaled
 from tests.refine.sample_objects import asymmetric_object
 from tests.segment.tabletop import scene_of, table_gaussians
 
@@ -127,3 +129,24 @@ def test_photos_of_another_scene_are_refused(scene, tmp_path):
     write_png(tmp_path / "other.png", torch.zeros(4, 4, 3))
     with pytest.raises(InputError, match="holds no photo of the scene, such as 0.jpg"):
         crop_object(scene, opaque_gaussians(scene, 1), SIDE, tmp_path)
+
+
+def test_upscaled_crop_is_the_restored_image_at_the_generators_size(scene, photos, shown):
+    """Restored at three times the size, then averaged; its camera and pose are those of the plain crop."""
+    large, calls = crop_object(scene, opaque_gaussians(scene, 1), 3 * SIDE, photos), []
+    tint = torch.tensor([0.0, 0.1, 0.2])
+
+    def restore(image, prompt, seed):
+        calls.append((image, prompt, seed))
+        return (image - tint).clamp(0, 1)
+
+    made = upscaled(large, SimpleNamespace(restore=restore), SIDE, "thing", 5)
+    assert [call[1:] for call in calls] == [("thing", 5)] and torch.equal(calls[0][0], large.image)
+    assert made.image.shape == (SIDE, SIDE, 3) and made.coverage.shape == (SIDE, SIDE)
+    outside, inside = made.coverage == 0, made.coverage > 0.99
+    assert bool((made.image[outside] == 1).all()) and int(outside.sum()) > 1000
+    expected = (large.image - tint).clamp(0, 1).reshape(SIDE, 3, SIDE, 3, 3).mean((1, 3))
+    torch.testing.assert_close(made.image[inside], expected[inside])
+    torch.testing.assert_close(made.K, shown.K, rtol=0.02, atol=0)
+    assert (made.image[inside] + tint - shown.image[inside]).abs().mean() < 0.03
+    assert made.place.scale == pytest.approx(shown.place.scale, rel=0.02)

@@ -61,12 +61,12 @@ def find(given: Path | None = None) -> OSEDiffFiles:
     for folder, lack in missing.items():
         if not lack:
             return OSEDiffFiles(folder / LORA, folder / BASE)
-    first = searched[0]
+    nearest = min(searched, key=lambda folder: len(missing[folder]))
     raise InputError(
-        f"osediff: the weights are not in {' or '.join(map(str, searched))} (no {', '.join(missing[first])}); fetch "
-        f"preset/models/{LORA} of https://github.com/cswry/OSEDiff (licence Apache-2.0) into {first}, and "
-        f"{', '.join(PARTS)} of https://huggingface.co/{SOURCE.repository} or of its copy {COPY} ({SOURCE.size}, "
-        f"licence {SOURCE.licence}) into {first / BASE}"
+        f"osediff: the weights are not in {' or '.join(map(str, searched))} ({nearest} lacks "
+        f"{', '.join(missing[nearest])}); fetch preset/models/{LORA} of https://github.com/cswry/OSEDiff (licence "
+        f"Apache-2.0) into {nearest}, and {', '.join(PARTS)} of https://huggingface.co/{SOURCE.repository} or of its "
+        f"copy {COPY} ({SOURCE.size}, licence {SOURCE.licence}) into {nearest / BASE}"
     )
 
 

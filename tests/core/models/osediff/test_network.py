@@ -105,6 +105,9 @@ def test_colours_keep_mean_and_standard_deviation():
     out = match_colours(image, source.clamp(0, 1))
     torch.testing.assert_close(out.mean((2, 3)), source.mean((2, 3)), rtol=0, atol=1e-4)
     torch.testing.assert_close(out.std((2, 3)), source.std((2, 3)), rtol=2e-3, atol=0)
+    small, other = image[0, :, :3, :4], source[0, :, :3, :4].clamp(0, 1)
+    expected = adain(small.permute(1, 2, 0), other.permute(1, 2, 0)).permute(2, 0, 1)
+    torch.testing.assert_close(match_colours(small[None], other[None])[0], expected)
     assert match_colours(image, torch.ones_like(image)).amin() > 0.98  # white stays white but for the 1e-5
 
 

@@ -1,7 +1,7 @@
 """The outline of the table that objects stand on: where cameras look past its edge, at what lies below.
 
 Where no camera does, as where the photos end, the table goes on. The outline is convex: half-planes through the edges,
-in DIRECTIONS directions, so that a notch in a table counts as table.
+in DIRECTIONS directions, so that a notch in a table counts as table; and objects that stand at its height are on it.
 """
 
 from __future__ import annotations
@@ -60,13 +60,24 @@ def table_outline(scene: Scene, device: str = "cpu") -> TableOutline | None:
     parts, count = ndimage.label(table)
     if not count:
         return None
-    largest = parts == 1 + np.argmax(np.bincount(parts[table])[1:])
-    edges = _edges(np.argwhere(largest), past, known, support.view.radius / support.cell)
+    largest = np.argwhere(parts == 1 + np.argmax(np.bincount(parts[table])[1:]))
+    edges = _edges(largest, _bases(scene, support), past, known, support.view.radius / support.cell)
     if not edges or not len(heights):
         return None
     normals, offsets = (np.array(each) for each in zip(*edges, strict=True))
     origin = support.view.focus[:2].double().numpy() - support.cell * (len(past) - 1) / 2  # of the first cell
     return TableOutline(normals, offsets * support.cell + normals @ origin, float(np.quantile(heights, LOWEST)))
+
+
+def _bases(scene: Scene, support: Support) -> np.ndarray:
+    """Cells (m, 2) of the Gaussians at the height of the table of the objects that do not reach far below it."""
+    cells = [torch.zeros(0, 2, dtype=torch.int64)]
+    for o in scene.objects:
+        means = scene.gaussians.means[scene.gaussians.object_id == o.id]
+        heights = support.heights(means)
+        if len(means) and float(heights.sort().values[len(means) // 20]) > -support.tolerance:
+            cells.append(support.cells(means[heights.abs() < support.tolerance]))
+    return torch.cat(cells).numpy()
 
 
 def _seen_past(
@@ -95,16 +106,18 @@ def _seen_past(
 
 
 def _edges(
-    table: np.ndarray, past: np.ndarray, known: np.ndarray, unit: float
+    table: np.ndarray, bases: np.ndarray, past: np.ndarray, known: np.ndarray, unit: float
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Outward normals and offsets of the edges of the cells `table` (m, 2), in cells; `unit` is one camera distance."""
+    """Outward normals and offsets of the edges of the cells `table` (m, 2) and `bases` (n, 2), in cells; `unit` is one
+    camera distance.
+    """
     edges = []
     for angle in np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False):
         normal = np.array([np.cos(angle), np.sin(angle)])
         along = np.array([-normal[1], normal[0]])
         height = table @ normal
-        end = np.quantile(height, 0.995)
-        edge = table[height > end - NEAR * unit] @ along
+        end = max(np.quantile(height, 0.995), (bases @ normal).max(initial=-np.inf))
+        edge = table[height > min(end, height.max()) - NEAR * unit] @ along
         t, h = np.meshgrid(
             np.arange(edge.min(), edge.max() + 1), np.arange(end + GAP * unit, end + (GAP + STRIP) * unit)
         )

@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from stages.core.perception.table_outline import table_outline
-from tests.tables import GROUND, HIGH, LOW, table_scene
+from stages.core.scene.gaussians import concatenate
+from tests.tables import GROUND, HIGH, LOW, level, table_scene
 
 
 def test_the_edges_of_a_table_are_where_the_ground_is_seen():
@@ -34,3 +36,15 @@ def test_where_no_camera_sees_the_ground_the_table_goes_on():
 def test_nothing_under_the_table_and_no_cameras_give_no_edge():
     assert table_outline(table_scene(ground=None)) is None
     assert table_outline(replace(table_scene(), cameras=None)) is None
+
+
+def test_objects_that_stand_at_its_height_are_on_the_table():
+    """One beyond the cells that are seen as table, and a leg beside it that goes down to the ground, which is not."""
+    slab = level(0.005, (0.5, -0.03), (0.6, 0.03), 0.01, 0.5)
+    leg = level(0.005, (-0.6, -0.03), (-0.5, 0.03), 0.01, 0.5)
+    down = torch.tensor([0.0, 0.0, 0.4]) * torch.rand(len(leg), 1, generator=torch.Generator().manual_seed(0))
+    things = [replace(slab, object_id=torch.ones_like(slab.object_id)),
+              replace(leg, means=leg.means - down, object_id=torch.full_like(leg.object_id, 2))]  # fmt: skip
+    outline = table_outline(table_scene(concatenate(things)))
+    assert float(outline.beyond(np.array([[0.58, 0.0]]))[0]) <= 0.02
+    assert float(outline.beyond(np.array([[-0.45, 0.0]]))[0]) > 0.05

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.backends import choose, pick_device
@@ -28,6 +30,7 @@ from stages.refine.options import BACKENDS, CONCURRENT, RefineOptions
 from stages.refine.outliers import floaters
 
 log = logging.getLogger(__name__)
+MAX_HIDDEN_WEIGHT = 0.3  # in any view, of a Gaussian that no camera sees [px of the downscaled images]
 
 
 def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen
@@ -66,10 +69,11 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
     """The three steps for objects on `support`."""
     completer = choose(BACKENDS, options.chosen)
-    g = grow_objects(scene.gaussians, support, _growth_radius(scene.gaussians))
-    outliers = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
-    scene = replace(scene, gaussians=g[~outliers])
-    observed = ObservedSpace.of(scene, pick_device(options.device))
+    g = scene.gaussians
+    stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
+    observed = ObservedSpace.of(replace(scene, gaussians=g[~stray]), pick_device(options.device))
+    g, hidden = _hidden_by_objects(g[~stray], support, observed)
+    scene = replace(scene, gaussians=g[~hidden])
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
     with tqdm(total=len(numbers), unit="object") as bar:
 
@@ -88,9 +92,24 @@ def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> S
     if options.background and support is not None:
         filled = fill_background(scene, observed, support, options.seed)
     new = len(filled.gaussians) - len(scene.gaussians)
-    log.info("  %d outliers removed, %d Gaussians added to the table", int(outliers.sum()), new)
+    log.info("  %d outliers and %d hidden Gaussians removed, %d added to the table", int(stray.sum()),
+             int(hidden.sum()), new)  # fmt: skip
     whole = replace(filled, gaussians=concatenate([filled.gaussians, added]))
     return with_raw(whole, scene) if options.keep_raw else whole
+
+
+def _hidden_by_objects(
+    g: Gaussians, support: Support | None, observed: ObservedSpace
+) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+    """The Gaussians with labels, and which of the unlabelled ones within and next to objects no camera sees.
+
+    Those that one sees stay as labelled, as `segment` has cut the objects' outlines in the views. Without cameras none
+    is known to be seen, and all take the label of their object.
+    """
+    grown = grow_objects(g, support, _growth_radius(g))
+    if not observed.views:
+        return grown, torch.zeros(len(g), dtype=torch.bool)
+    return g, (grown.object_id != g.object_id) & (observed.weight < MAX_HIDDEN_WEIGHT)
 
 
 def with_raw(whole: Scene, raw: Scene) -> Scene:

@@ -7,7 +7,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres, intrinsics, look_at
-from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.harmonics import C0, rgb_to_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
@@ -23,7 +23,7 @@ from stages.refine.disc_gaussians import disc_gaussians
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.stage import refine, run
-from tests.conftest import random_gaussians
+from tests.conftest import ball, random_gaussians
 from tests.segment.tabletop import WOOD, block, coloured_gaussians, orbit_cameras, scene_of, table_gaussians
 
 SIDES = (0.2, 0.16, 0.12)
@@ -109,6 +109,21 @@ def test_unlabelled_parts_under_an_object_are_replaced_by_table():
         assert torch.allclose(seen(scene, above, 0, target)[0], torch.tensor(rgb), atol=0.1)
         now, alpha = seen(refined, above, 0, target)
         assert alpha > 0.9 and torch.allclose(now, torch.tensor(WOOD), atol=0.08)
+
+
+def test_labels_stay_where_cameras_see_them_and_what_none_sees_in_an_object_is_removed(before):
+    """A white sheet beside the block, as close as its own Gaussians are to each other, and stray ones inside it."""
+    sheet_ = block((SIDES[0] / 2 + 0.008, 0.0), (0.004, 0.1, 0.1), (0.9, 0.9, 0.9), 0)
+    inside = ball((0.0, 0.0, 0.05), 0.02, 200, (0.9, 0.9, 0.9), 0)
+    scene = replace(before, gaussians=concatenate([before.gaussians, sheet_, inside]))
+    done = refine(scene, RefineOptions(completer="none", background=False))
+    white = (done.gaussians.sh[:, 0] * C0).amin(1) > 0.2
+    assert not done.gaussians.object_id[white].any()
+    assert int(white.sum()) > 0.7 * len(sheet_)
+    assert not ((done.gaussians.means - torch.tensor([0, 0, 0.05])).norm(dim=1)[white] < 0.03).any()
+    blind = refine(replace(scene, cameras=None), RefineOptions(completer="none", background=False))
+    white = (blind.gaussians.sh[:, 0] * C0).amin(1) > 0.2
+    assert int((blind.gaussians.object_id[white] == 1).sum()) > 0.9 * len(inside)
 
 
 def test_table_is_filled_where_a_large_gaussian_is_removed(before):

@@ -29,8 +29,8 @@ def visible_from_above(surface: Surface) -> Surface:
     return surface.kept((surface.normals[:, 2] > -0.5) & (surface.points[:, 2] > 0))
 
 
-def table_gaussians(spacing: float = 0.012) -> Gaussians:
-    return coloured_gaussians(sheet(1.2, 1.2, spacing), WOOD, 0)
+def table_gaussians(spacing: float = 0.012, side: float = 1.2) -> Gaussians:
+    return coloured_gaussians(sheet(side, side, spacing), WOOD, 0)
 
 
 def block(centre: tuple, sides: tuple, rgb: tuple, object_id: int, spacing: float = 0.007) -> Gaussians:
@@ -51,10 +51,10 @@ def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: 
     return Scene(moved, (), orbit_cameras() if cameras else None, 0.0)
 
 
-def three_apart(**how) -> Scene:
-    """A red block, a blue egg, a green tower, apart on a table."""
+def three_apart(side: float = 1.2, **how) -> Scene:
+    """A red block, a blue egg, a green tower, apart on a table; the time of networks is that of the table's voxels."""
     return scene_of(
-        table_gaussians(), block((-0.2, -0.1), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
+        table_gaussians(side=side), block((-0.2, -0.1), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.2, -0.1, 0.07), (0.06, 0.06, 0.07), (0.1, 0.2, 0.8), 2),
         block((0.02, 0.2), (0.06, 0.06, 0.16), (0.1, 0.6, 0.2), 3), **how,
     )  # fmt: skip

@@ -19,16 +19,14 @@ def without_labels(scene: Scene) -> Scene:
 
 
 def test_objects_apart_on_a_table_are_found():
-    scene = three_apart()
+    scene = three_apart(side=0.7)
     found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
     overlaps = best_overlap(found, scene.gaussians.object_id)
     assert min(overlaps.values()) > 0.85, overlaps
 
 
 def test_a_bare_table_has_no_objects():
-    table = table_gaussians()
-    table = table[table.means[:, :2].abs().amax(1) < 0.35]  # the time is that of its voxels
-    assert not segment(scene_of(table), SegmentOptions(backend="learned")).objects
+    assert not segment(scene_of(table_gaussians(side=0.7)), SegmentOptions(backend="learned")).objects
 
 
 def test_weights_that_do_not_exist_are_named(tmp_path):

@@ -272,7 +272,7 @@ def test_doubled_resolution_keeps_bodies_on_the_floor(file):
 
 def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path, monkeypatch):
     monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes a second
-    scene = three_apart(noise=0.002)
+    scene = three_apart(side=0.7, noise=0.002)
     blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
     write_scene(tmp_path / "scene.ply", replace(scene, gaussians=blank))
     segment(tmp_path / "scene.ply", tmp_path / "labelled.ply")

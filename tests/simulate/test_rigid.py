@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.physics import solid_surface
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
@@ -27,9 +28,10 @@ G = 9.81
 
 
 @pytest.fixture(autouse=True)
-def few_particles(monkeypatch):
-    """Those of a body decide on whether it stands on the floor; its mass and contacts have other sources."""
+def small_bodies(monkeypatch):
+    """Few particles, which decide on whether a body stands on the floor, and bodies half as fine as usual."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
+    monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
 
 
 @cache
@@ -188,8 +190,9 @@ def test_a_body_of_several_parts_slides_by_v2_over_2_mu_g(tmp_path):
     assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
 
 
-def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path):
+def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path, monkeypatch):
     """The contacts of their surfaces are inelastic: a cross that falls onto another by .12 stays on it."""
+    monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 48)  # as usual: the bars are a sixth of the size
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), cross().moved((0, 0, 0.2)), loss=0.1, steps=18)
     z, height = t.com[:, 1, 2], 0.075 + 0.15 * 0.05  # what is thicker than its Gaussians' centres
     hit = int((z < height).nonzero()[0])

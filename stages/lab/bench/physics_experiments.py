@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import product
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Float
@@ -75,11 +77,12 @@ class Experiment:
         return low <= (measured - self.value) / self.scale <= high
 
 
-def experiments() -> dict[str, Experiment]:
+@cache
+def experiments() -> Mapping[str, Experiment]:
     """All experiments by name."""
     groups = (_slides, _slopes, _rolls, _rocking, _creep, _falls, _torques, _towers, _invariance, _collisions,
               _rebounds, _bounces, _stacks, _piles, _boxes)  # fmt: skip
-    return {e.name: e for group in groups for e in group()}
+    return MappingProxyType({e.name: e for group in groups for e in group()})
 
 
 def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Specimen:

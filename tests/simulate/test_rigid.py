@@ -34,6 +34,12 @@ def small_bodies(monkeypatch):
     monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
 
 
+@pytest.fixture
+def usual_bodies(small_bodies, monkeypatch):
+    """As fine as usual, for contacts of bodies whose parts are thin; of surfaces that no other test has."""
+    monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 48)
+
+
 @cache
 def cube(side: float, x: float, bottom: float) -> Surface:
     return box((side, side, side), side / 16).moved((x, 0.0, bottom + side / 2))
@@ -190,9 +196,9 @@ def test_a_body_of_several_parts_slides_by_v2_over_2_mu_g(tmp_path):
     assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
 
 
-def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("usual_bodies")
+def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path):
     """The contacts of their surfaces are inelastic: a cross that falls onto another by .12 stays on it."""
-    monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 48)  # as usual: the bars are a sixth of the size
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), cross().moved((0, 0, 0.2)), loss=0.1, steps=18)
     z, height = t.com[:, 1, 2], 0.075 + 0.15 * 0.05  # what is thicker than its Gaussians' centres
     hit = int((z < height).nonzero()[0])
@@ -328,6 +334,7 @@ def test_a_ball_rests_on_a_body_of_several_parts_whatever_sticks_out_of_its_surf
     torch.testing.assert_close(t.com[-1, 1], torch.tensor([0.0, 0.0, 0.4]), rtol=0, atol=2e-3)
 
 
+@pytest.mark.usefixtures("usual_bodies")
 @pytest.mark.parametrize("friction", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
 def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
     t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), cross().moved((-0.3, 0, 0.325)), pin=("1",), friction=friction,

@@ -13,6 +13,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
+from stages.core.physics import solid_surface
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import DEFAULT_MATERIAL, Material
 from stages.core.physics.mpm.domain import MAX_NODES
@@ -39,7 +40,9 @@ pytestmark = pytest.mark.usefixtures("device")
 
 @pytest.fixture(autouse=True)
 def small_draft(monkeypatch):
+    """Few particles, and bodies half as fine as usual."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
+    monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
 
 
 @pytest.fixture(scope="module")

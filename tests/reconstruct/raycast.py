@@ -55,8 +55,8 @@ def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
         limits = torch.tensor([a, b, top]) + 1e-4
         inside = (p[..., :2].abs() <= limits[:2]).all(-1) & (p[..., 2] >= 0) & (p[..., 2] <= limits[2])
         hit = inside & (t > 0) & (t < depth)
-        u, v = (p[..., k] for k in range(3) if k != axis)
-        image = torch.where(hit[..., None], texture(u, v, seed), image)
+        u, v = (p[hit][:, k] for k in range(3) if k != axis)
+        image[hit] = texture(u, v, seed)
         depth = torch.where(hit, t, depth)
     return image, depth
 

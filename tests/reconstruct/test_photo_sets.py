@@ -106,7 +106,7 @@ def test_mirror_in_the_scene(tmp_path):
 
 def test_duplicate_photos(tmp_path):
     true = arc(4, (320, 240), sweep=40.0)
-    images = [photograph(true, i)[0] for i in (0, 0, 1, 1, 2, 2, 3, 3)]
+    images = [image for i in range(4) for image in [photograph(true, i)[0]] * 2]
     model = sfm.estimate_cameras(as_photos(images, tuple("abcdefgh"), tmp_path))
     twice = Cameras(*(t.repeat_interleave(2, 0) for t in (true.viewmats, true.Ks, true.sizes)), tuple("abcdefgh"))
     assert len(model.cameras) == 8 and max_position_error(model, twice) < 0.03

@@ -42,6 +42,7 @@ def small_scenes(monkeypatch):
     monkeypatch.setattr(tabletops, "make_object", simple_object)
     for name, value in (("WIDTH", 320), ("HEIGHT", 240), ("FOCAL", 320.0)):
         monkeypatch.setattr(tabletops, name, value)
+    monkeypatch.setattr(tabletops, "DISTANCE_SAMPLES", 500)
     monkeypatch.setattr(backgrounds, "TABLE_SPACING", 0.047)
     monkeypatch.setattr(backgrounds, "ROOM_SPACING", 0.28)
     tabletops._resting.cache_clear()
@@ -147,7 +148,7 @@ def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
     few = mask_generation.MaskGenerationOptions(grid=2, min_iou=-9.0, min_stability=0.0)
     monkeypatch.setattr(segmenter, "propose_masks", partial(mask_generation.propose_masks, options=few))
     monkeypatch.setattr(discovery, "SEARCHED_VIEWS", 1)
-    scene, options = three_apart(), bench_segment.SegmentBenchOptions(weights=save_tiny_model(tmp_path))
+    scene, options = three_apart(side=0.7), bench_segment.SegmentBenchOptions(weights=save_tiny_model(tmp_path))
     assert bench_segment.available_networks(options) == (["sam2"], [])
     found = bench_segment.segment_by_network(scene, "sam2", options)
     assert found.shape == scene.gaussians.object_id.shape  # the network is random, so its objects are arbitrary

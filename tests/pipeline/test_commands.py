@@ -15,6 +15,8 @@ from ngff_cli import app as commands
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
 from ngff_cli.options import print_results
+from stages.core.models.segmenter import segment as network_segmenter
+from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.reconstruct.options import QUALITY_PRESETS
@@ -102,6 +104,7 @@ def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
     """Each on the output of the one before, on a named device."""
     draft = dataclasses.replace(QUALITY_PRESETS["draft"], gaussians=2000)
     monkeypatch.setitem(QUALITY_PRESETS, "draft", draft)
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes time
     cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
     scene, labelled, refined, motion = (tmp_path / name for name in ("a.ply", "b.ply", "c.ply", "t.h5"))
     quick = "--quality", "draft"

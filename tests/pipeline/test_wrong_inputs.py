@@ -11,6 +11,8 @@ import torch
 
 from ngff_cli.options import run_command_line
 from stages.core.errors import InputError
+from stages.core.models.segmenter import segment as network_segmenter
+from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.scene_ply import write_scene
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
@@ -54,6 +56,11 @@ WRONG = [
     ("evaluate", "{}/good.ply", "--against", "{}/absent.ply"),
     ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/nowhere/m.json"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def quick_segmentation(monkeypatch):
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes time
 
 
 @pytest.fixture(scope="module")

@@ -45,14 +45,14 @@ def test_checker_pattern_continues(shade):
 @pytest.mark.parametrize("slope", [-0.6, pytest.param(0.3, marks=pytest.mark.slow)], ids=["falling", "rising"])
 def test_straight_edges_continue(slope):
     """Across a wide round hole runs a strip of table between two woven mats: no mean of all three, and no bulge."""
-    side, colours = 160, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])
+    side, colours = 120, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])
     y, x = np.mgrid[:side, :side] - side / 2
     away = (y - slope * x) / np.hypot(1, slope)
     which = (away > -10).astype(int) + (away > 10)
     weave = 0.06 * np.sin(1.3 * x + 0.4 * y) * (which != 1)
     grain = 0.02 * np.random.default_rng(0).standard_normal((side, side, 1))
     rgb = (colours[which] + weave[..., None] + grain).astype(np.float32)
-    hole = np.hypot(y, x) < 36
+    hole = np.hypot(y, x) < 28
     out = filled(rgb, hole)
     nearest = np.linalg.norm(out[..., None, :] - colours, axis=-1).argmin(-1)
     assert (nearest != which)[hole].mean() < 0.02

@@ -10,7 +10,7 @@ from stages.core.models.segmenter.segment import find, load_segmenter
 from stages.core.scene.scene import Scene
 from stages.segment.learned import segment
 from stages.segment.options import SegmentOptions
-from tests.segment.tabletop import best_overlap, scene_of, table_gaussians, three_apart
+from tests.segment.tabletop import best_overlap, egg, scene_of, table_gaussians, three_apart
 
 
 def without_labels(scene: Scene) -> Scene:
@@ -23,6 +23,16 @@ def test_objects_apart_on_a_table_are_found():
     found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
     overlaps = best_overlap(found, scene.gaussians.object_id)
     assert min(overlaps.values()) > 0.85, overlaps
+
+
+def test_an_object_that_fills_the_photos_is_one():
+    """It is .8 high, with cameras at a distance of one unit."""
+    r = 0.4
+    body = [egg((0, 0, r), (0.5 * r, 0.4 * r, r), (0.8, 0.1, 0.1), 1, 3000),
+            egg((0.5 * r, 0, 1.2 * r), (0.5 * r, 0.2 * r, 0.2 * r), (0.8, 0.1, 0.1), 1)]  # fmt: skip
+    scene = scene_of(table_gaussians(side=0.8, spacing=0.025), *body)
+    found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
+    assert best_overlap(found, scene.gaussians.object_id)[1] > 0.9
 
 
 def test_a_bare_table_has_no_objects():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.models.segmenter.network import Segmenter
-from stages.core.models.segmenter.segment import ScoredCandidates, SegmenterOptions, outlined, score_at
+from stages.core.models.segmenter.segment import REDUCTIONS, ScoredCandidates, SegmenterOptions, outlined, score_at
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES
 from stages.core.perception.view_outlines import refine_outlines
@@ -46,7 +46,7 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options
         raise InputError(f"--points {clicks[0].text!r}: the scene has no surface in reach of its cameras")
     means = scene.gaussians.means[index]
     found: dict[int, tuple[float, Int[Tensor, "n"]]] = {}
-    scored = [score_at(surfels, scale, model) for scale in SCALES]
+    scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
     for at_scale in scored:
         paths = [_path(at_scale, (means - click.point).norm(dim=1) / view.radius) for click in clicks]
         usable = at_scale.usable(options.min_size).numpy()
@@ -66,7 +66,7 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options
     labels = torch.zeros(len(surfels), dtype=torch.int64)
     for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small ones last
         labels[members] = number
-    ids[index] = outlined(surfels, labels, scored)
+    ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
     return refine_outlines(scene, ids)
 
 

@@ -32,6 +32,8 @@ WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
 MAX_VOXELS = 80_000  # nearest to the focus
 OBJECT_COST = 0.45  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+REDUCTIONS = (0.667, 0.444)  # of the scene, so that objects that fill the photos are as large as in the training
+LONG, MIN_LONG_IOU = 0.4, 0.8  # least length of those [camera distance], and expected IoU: kermit's pile has .72
 MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
@@ -111,10 +113,10 @@ def object_ids(
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
         return ids
-    scored = [score_at(surfels, scale, model) for scale in SCALES]
+    scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
     labels = best_objects([s.best(options) for s in scored])
     labels = torch.where(labels <= options.max_objects, labels, 0)
-    ids[index] = outlined(surfels, labels, scored)
+    ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
     ids = refine_outlines(scene, ids, device=model.input_projection.weight.device)
     few = ids.bincount() < MIN_GAUSSIANS
     return torch.where(few[ids], 0, ids)
@@ -136,13 +138,17 @@ class ScoredCandidates:
     candidates: Candidates
     ious: Float[Tensor, "k"]  # expected
     extents: Float[Tensor, "k"]  # longest side along the axes [camera distance]
+    scale: float
     owner: Int[Tensor, "n"]  # voxel of each surfel, -1 beyond MAX_VOXELS
     chance: Float[Tensor, "n 3"]  # of the classes, of each surfel; NaN beyond MAX_VOXELS
 
     def usable(self, min_size: float) -> Bool[Tensor, "k"]:
         """Which candidates are neither too small nor too large."""
         many = self.candidates.sizes > MIN_VOXELS - 0.5
-        return many & (self.extents >= min_size) & (self.extents <= MAX_SIZE)
+        if self.scale >= 1:
+            return many & (self.extents >= min_size) & (self.extents <= MAX_SIZE)
+        long = (self.extents >= max(min_size, LONG)) & (self.extents <= MAX_SIZE / self.scale)
+        return many & long & (self.ious >= MIN_LONG_IOU)
 
     def labels(self, nodes: np.ndarray) -> Int[Tensor, "n"]:
         """The place in `nodes`, which are disjoint, of the one that holds each surfel; -1 for none."""
@@ -181,7 +187,7 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
     owner, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
     owner[near] = grid.owner.cpu()
     chance[near] = found.logits.softmax(1).cpu()[owner[near]]
-    return ScoredCandidates(candidates, ious, candidates.extents / scale, owner, chance)
+    return ScoredCandidates(candidates, ious, candidates.extents / scale, scale, owner, chance)
 
 
 def averaged_prediction(surfels: ScenePoints, grid: VoxelGrid, model: Segmenter) -> tuple[list[Level], Prediction]:

@@ -1,10 +1,9 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
-penetration: deepest keypoint of an object inside another one or below the floor, where the table has not ended (with an
-engine that ends it), beyond the depth at rest and the one
-to which --lift put it there, of which a warning tells, relative to the smaller height of both. A keypoint outside its
-own mean surface, by noise or as a floater, counts by so much less; in other objects, so does one below the floor at
-rest, where bodies end.
+penetration: deepest keypoint of an object inside another one or below the floor (only where the table goes on, with an
+engine that ends it), beyond the depth at rest and the one to which --lift put it there, of which a warning tells,
+relative to the smaller height of both. A keypoint outside its own mean surface, by noise or as a floater, counts by so
+much less; in other objects, so does one below the floor at rest, where bodies end.
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the

@@ -95,6 +95,6 @@ def test_what_slides_over_the_edge_lands_on_the_ground_and_does_not_sink(tmp_pat
 
 def test_engines_without_edges_say_so(tmp_path, caplog):
     write_scene(tmp_path / "scene.ply", on_table(block(0.25)))
-    options = options_of(tmp_path, velocity=("object=1 3,0,0",), steps=25, dt=0.01, device="cpu")
+    options = options_of(tmp_path, velocity=("object=1 3,0,0",), steps=25, dt=0.01)
     run(tmp_path / "scene.ply", tmp_path / "t.h5", replace(options, engine="ngff"))
     assert "object 1 (body1) is beyond the edge of the table" in caplog.text

@@ -181,7 +181,8 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
         within = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
         scaled, near = scaled[within], within.cpu()
         grid = voxelise(scaled)
-    levels, found = averaged_prediction(scaled, grid, model)
+    # large candidates hardly change from copy to copy
+    levels, found = averaged_prediction(scaled, grid, model, COPIES if scale >= 1 else 1)
     candidates = find_candidates(grid, levels, found, model)
     ious = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
     owner, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
@@ -190,8 +191,10 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
     return ScoredCandidates(candidates, ious, candidates.extents / scale, scale, owner, chance)
 
 
-def averaged_prediction(surfels: ScenePoints, grid: VoxelGrid, model: Segmenter) -> tuple[list[Level], Prediction]:
-    """The levels of the voxels `grid` of the surfels, and the mean of the predictions for COPIES of the scene.
+def averaged_prediction(
+    surfels: ScenePoints, grid: VoxelGrid, model: Segmenter, copies: int = COPIES
+) -> tuple[list[Level], Prediction]:
+    """The levels of the voxels `grid` of the surfels, and the mean of the predictions for `copies` of the scene.
 
     The copies are mirrored in both diagonals or given a half turn, and moved by parts of a voxel. The network is
     trained on such, but neither it nor the division into voxels is symmetric.
@@ -207,7 +210,7 @@ def averaged_prediction(surfels: ScenePoints, grid: VoxelGrid, model: Segmenter)
         p = model(copy.features, pyramid(copy.cells, count))
         return Prediction(*(grid.means(x[copy.owner]) for x in (p.logits, p.offsets @ R, p.embedding)))
 
-    parts = [predict(k) for k in range(COPIES)] if device.type == "cuda" else parallel_map(predict, range(COPIES))
+    parts = [predict(k) for k in range(copies)] if device.type == "cuda" else parallel_map(predict, range(copies))
     return levels, Prediction(*(torch.stack([getattr(p, f.name) for p in parts]).mean(0) for f in fields(Prediction)))
 
 

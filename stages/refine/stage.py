@@ -16,7 +16,7 @@ from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.kernels.threads import parallel_map
-from stages.core.perception.observed_space import ObservedSpace, object_psnr
+from stages.core.perception.observed_space import MAX_HIDDEN_WEIGHT, ObservedSpace, object_psnr
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
@@ -30,7 +30,6 @@ from stages.refine.options import BACKENDS, CONCURRENT, RefineOptions
 from stages.refine.outliers import floaters
 
 log = logging.getLogger(__name__)
-MAX_HIDDEN_WEIGHT = 0.3  # in any view, of a Gaussian that no camera sees [px of the downscaled images]
 
 
 def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen

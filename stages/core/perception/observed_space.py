@@ -18,6 +18,7 @@ from stages.core.scene.scene import Scene
 
 FAR = 1e9  # depth of pixels without a surface
 MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # of pixels with a surface, and without one; others are unknown
+MAX_HIDDEN_WEIGHT = 0.3  # in any view, of a Gaussian that no camera sees [px of the downscaled images]
 MIN_VIEWS_FOR_TWO = 6  # cameras from which on two must agree that a point is free
 
 
@@ -74,7 +75,7 @@ class ObservedSpace:
             yield inside, z[inside], depth[y, x]
 
     def is_hidden(
-        self, scene: Gaussians, added: Gaussians, max_weight: float = 0.3, max_leak: float = 0.1
+        self, scene: Gaussians, added: Gaussians, max_weight: float = MAX_HIDDEN_WEIGHT, max_leak: float = 0.1
     ) -> Bool[Tensor, "m"]:
         """Which Gaussians could be added to the scene with almost no change of its images.
 

@@ -19,7 +19,8 @@ from stages.core.perception.support import Support, find_support
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-# The five below were chosen on kitchen, kermit, the desk and banana, whose carpet has no edge [camera distances].
+# Those up to MIN_KNOWN were chosen on kitchen, kermit, the desk and banana, whose carpet has no edge. Lengths are in
+# camera distances.
 MIN_DROP = 0.05  # from the table to what is seen past it, along the ray
 MIN_VIEWS = 3  # that know a cell
 STRIP, GAP, NEAR = 0.1, 0.01, 0.03  # width of the strip beyond an edge, its distance, and depth of the edge itself

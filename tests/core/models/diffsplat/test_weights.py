@@ -33,7 +33,7 @@ def test_all_tensors_are_loaded(model):
     for loaded, expected in ((model.unet, unet()), (model.gsvae, autoencoder(12)), (model.vae, autoencoder(3))):
         state = loaded.state_dict()
         assert state.keys() == expected.state_dict().keys()
-        assert all(torch.equal(state[k], v) for k, v in expected.state_dict().items())
+        assert all(torch.equal(state[k].cpu(), v) for k, v in expected.state_dict().items())
         assert not any(p.requires_grad for p in loaded.parameters())
 
 

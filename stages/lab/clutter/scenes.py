@@ -49,6 +49,8 @@ SHADOW_CELL = 0.01  # [camera distance]
 COMPOSITE_SHARE = 0.45  # of the things from code that have several parts
 ROW_SHARE = 0.35  # of scenes with a row of books on edge
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
+CLOSE_SHARE = 0.15  # of scenes of one to three things photographed from nearby
+CLOSE_SIZES = 0.5, 1.2  # their longest sides [camera distance]
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,11 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
     if rng.uniform() < 0.3:  # a few large things
         size = [min(0.6, 1.6 * s) for s in size]
     row = _row_of_books(shelf, furniture, rng) if rng.uniform() < ROW_SHARE else []
+    nearby = np.random.default_rng([options.seed, index, 5])
+    if nearby.uniform() < CLOSE_SHARE:
+        few = int(nearby.integers(1, 4))
+        size = np.exp(nearby.uniform(*np.log(CLOSE_SIZES), min(few, wanted))).tolist()
+        props, row = props[:few], []
     things = _arranged(furniture, props, size, row, rng)
     objects, parts = [], [painted(furniture, rng)]
     for prop, g in things:

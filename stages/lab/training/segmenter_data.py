@@ -13,6 +13,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
+from stages.core.models.segmenter.segment import MAX_SIZE, REDUCTIONS
 from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, neighbour_table, voxelise
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.clutter.examples import Example, labelled, write_example
@@ -68,6 +69,8 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
     lean = np.array([[1, 0, tilt[0]], [0, 1, tilt[1]], [-tilt[0], -tilt[1], 1]])
     R = torch.from_numpy(lean @ turn).float()
     scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
+    if _longest(s.points, labels) > MAX_SIZE:  # such scenes are also segmented at reduced size
+        scale *= float(rng.choice(REDUCTIONS))
     points = scale * s.points @ R.mT + torch.tensor([0, 0, float(rng.normal(0, 0.004))])
     points = points + 0.004 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=points.shape)).float()
     points = torch.cat([points[:, :2], points[:, 2:] + _relief(points[:, :2], rng)], 1)
@@ -80,6 +83,13 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
     normals = torch.nn.functional.normalize(normals, dim=1)
     moved = replace(s, points=points, lab=lab, normals=normals, toward=s.toward @ R.mT)
     return moved, labels
+
+
+def _longest(points: Float[Tensor, "n 3"], labels: Int[Tensor, "n"]) -> float:
+    """Longest side along the axes of the largest object [camera distance]; without the outermost 2 % of its points."""
+    count = torch.bincount(labels.clamp_min(0))
+    parts = [points[labels == k] for k in torch.nonzero(count >= 20)[:, 0].tolist() if k]
+    return max((float((p.quantile(0.99, 0) - p.quantile(0.01, 0)).max()) for p in parts), default=0.0)
 
 
 def _repainted(s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generator) -> ScenePoints:

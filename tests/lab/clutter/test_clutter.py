@@ -12,16 +12,17 @@ from safetensors.torch import load_file, save_file
 
 from stages.core.errors import InputError
 from stages.core.models.segmenter.network import CANDIDATE_FEATURES, SCORES
-from stages.core.models.segmenter.segment import load_segmenter, object_ids
+from stages.core.models.segmenter.segment import MAX_SIZE, REDUCTIONS, load_segmenter, object_ids
+from stages.core.models.segmenter.voxels import ScenePoints
 from stages.core.scene.files import sha256
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.clutter import scenes
 from stages.lab.clutter.composites import make_composite
-from stages.lab.clutter.examples import read_example
+from stages.lab.clutter.examples import Example, read_example
 from stages.lab.clutter.noise_model import Degradation, observed
 from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
-from stages.lab.training import train_segmenter
-from stages.lab.training.segmenter_data import targets
+from stages.lab.training import segmenter_data, train_segmenter
+from stages.lab.training.segmenter_data import SCALE_RANGE, augmented, targets
 from tests.conftest import random_gaussians
 
 pytest.importorskip("mujoco")
@@ -135,6 +136,34 @@ def _with_fewer_score_features(weights: Path, out: Path) -> Path:
     card = json.loads(weights.with_suffix(".json").read_text())
     out.with_suffix(".json").write_text(json.dumps({**card, "sha256": sha256(out)}))
     return out
+
+
+def test_close_scenes_have_few_large_things(monkeypatch):
+    monkeypatch.setattr(scenes, "CLOSE_SHARE", 1.0)
+    scene = make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
+    g = scene.gaussians
+    sides = [(m.amax(0) - m.amin(0)).norm() for m in (g.means[g.object_id == o.id] for o in scene.objects)]
+    assert 1 <= len(sides) <= 3 and min(sides) > 0.9 * scenes.CLOSE_SIZES[0]
+
+
+@pytest.mark.parametrize("length", [0.3, 0.9])
+def test_large_objects_are_trained_on_at_reduced_size(monkeypatch, length):
+    monkeypatch.setattr(segmenter_data, "_with_holes", lambda s, rng: torch.ones(len(s), dtype=torch.bool))
+    n = 400
+    along = torch.cat([torch.linspace(0, length, n // 2), torch.linspace(-1.5, 1.5, n // 2)])
+    points = torch.stack([along, torch.zeros(n), torch.zeros(n)], 1)
+    up = torch.tensor([[0.0, 0, 1]]).expand(n, 3)
+    example = Example(
+        ScenePoints(points, torch.full((n, 3), 50.0), up, torch.zeros(n), up), (torch.arange(n) < n // 2).long()
+    )
+    reduced = []
+    for seed in range(20):
+        s, labels = augmented(example, np.random.default_rng(seed))
+        own = s.points[labels == 1]
+        reduced.append(float((own[:, None] - own).norm(dim=2).max()) / length)
+    expected = np.array(SCALE_RANGE) * ((1, 1) if length < MAX_SIZE else (min(REDUCTIONS), max(REDUCTIONS)))
+    assert expected[0] * 0.8 < min(reduced) < max(reduced) < expected[1] * 1.05
+    assert max(reduced) > 0.8 * expected[1]
 
 
 def test_objects_of_several_parts_rest_in_each_others_concavities():

@@ -12,7 +12,6 @@ voxels and axes at once by bisection, with hulls that are bounded in the fixed d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -59,7 +58,7 @@ class Part:
 def divide(cells: np.ndarray, others: np.ndarray) -> np.ndarray:
     """The part, from 0, of each of the unit voxels at cells (m, 3) of a body; `others` (n, 3) are points outside it."""
     body = _Body(cells, others)
-    parts = [body.part(np.arange(len(cells)), np.arange(len(body.empty)))]
+    parts = [body.whole()]
     while len(parts) < MAX_PARTS and sum(p.cost for p in parts) > ACCEPTED * len(body.shell):
         worst = max(range(len(parts)), key=lambda k: -1.0 if parts[k].accepted else parts[k].cost)
         sides = None if parts[worst].accepted else body.cut(parts[worst])
@@ -94,78 +93,93 @@ class _Body:
         self.empty = np.concatenate([holes - 1 + low, others]).astype(np.float32)
         self.weight = np.concatenate([share * distance[tuple(holes.T)], of_others])
 
-    @cached_property
-    def _bounds(self) -> np.ndarray:
-        """Extent (n, d) of the empty voxels along BOUNDS."""
-        return self.empty @ BOUNDS.T
+    def whole(self) -> Part:
+        """The part of all voxels."""
+        reach = (self.cells[self.shell] @ BOUNDS.T).max(0)
+        return self.part(np.arange(len(self.cells)), np.arange(len(self.empty)), reach)
 
-    def part(self, rows: np.ndarray, candidates: np.ndarray) -> Part:
-        """The part of the voxels `rows`; the empty voxels in its hull are among `candidates`."""
+    def part(self, rows: np.ndarray, candidates: np.ndarray, reach: np.ndarray) -> Part:
+        """The part of the voxels `rows`, whose extent along BOUNDS is `reach` (d,); the empty voxels in its hull are
+        among `candidates`.
+        """
         shell = rows[self._on_shell[rows]]
         points = self.cells[shell]
-        inside = candidates[(self._bounds[candidates] <= (points @ BOUNDS.T).max(0) + 1e-3).all(1)]
+        inside = self._within(candidates, BOUNDS[:6], reach[:6])  # first, as most others are not
+        inside = self._within(inside, BOUNDS[6:], reach[6:])
         try:
-            faces = ConvexHull(points[np.unique((points @ EXTREMES[::2].T).argmax(0))]).equations.astype(np.float32)
-            inside = inside[(self.empty[inside] @ faces[:, :3].T <= 1e-3 - faces[:, 3]).all(1)]
+            faces = ConvexHull(points[np.unique((EXTREMES[::2] @ points.T).argmax(1))]).equations.astype(np.float32)
+            inside = self._within(inside, faces[:, :3], -faces[:, 3])
         except (QhullError, ValueError):  # flat: it has the space within its bounds
             pass
         return Part(rows, shell, inside, float(self.weight[inside].sum()))
 
+    def _within(self, empty: np.ndarray, normals: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Those of some empty voxels that are on the inner sides of planes."""
+        return empty[(normals @ self.empty[empty].T <= reach[:, None] + 1e-3).all(0)]
+
     def cut(self, part: Part) -> tuple[Part, Part] | None:
         """Both sides of the plane that leaves least cost; None without any."""
         points = self.cells[part.shell]
-        axes = np.concatenate([np.eye(3), np.linalg.eigh(np.cov(points.T))[1].T]).astype(np.float32)
+        arm = points - points.mean(0, dtype=float)
+        axes = np.concatenate([np.eye(3), np.linalg.eigh(arm.T @ arm)[1].T]).astype(np.float32)
         along = points @ axes.T
         low = along.min(0)
         width = np.maximum((along.max(0) - low) / LAYERS, 1.0)
-        layer = _layers(along, low, width)
-        first, last = _hulls_of_layers(points, layer)
+        layer = _layers(along, low, width).T
+        count = _sums(layer, np.ones_like(layer))
+        first, last = bounds = _hulls_of_layers(points, layer, count)
         some = part.empty[:: -(-len(part.empty) // MAX_SAMPLES)]
-        extent, weight = self._bounds[some], self.weight[some]
-        below = _first_inside(first, extent)
-        above = np.maximum(LAYERS - 1 - _first_inside(last, extent), 0)  # the last layer from which all above have it
-        best, where = np.inf, None
-        for a in range(len(axes)):
-            cost = np.cumsum(np.bincount(below[a], weight, LAYERS + 1))[:LAYERS]  # of the hull of layers 0..k
-            cost = cost + np.cumsum(np.bincount(above[a], weight, LAYERS + 1)[::-1])[::-1][1:]  # and of the others
-            count = np.cumsum(np.bincount(layer[:, a], minlength=LAYERS))
-            cost += BALANCE * part.cost * np.abs(2 * count / len(points) - 1)
-            cost[(count < MIN_SHELL) | (count > len(points) - MIN_SHELL)] = np.inf
-            used = np.flatnonzero(np.diff(count, prepend=0))
-            cost[: used[0] + MIN_LAYERS - 1] = cost[max(used[-1] - MIN_LAYERS + 1, 0) :] = np.inf
-            k = int(cost.argmin())
-            if cost[k] < best:
-                best, where = cost[k], (a, k)
-        if where is None:
+        weight = np.broadcast_to(self.weight[some], (len(axes), len(some)))
+        below, above = _first_inside(bounds, self.empty[some] @ BOUNDS.T)
+        cost = np.cumsum(_sums(below, weight), 1)  # of the hull of layers 0..k, and of the others
+        cost[:, :-1] += np.cumsum(_sums(above, weight), 1)[:, -2::-1]
+        ends = LAYERS - 1 - (count[:, ::-1] > 0).argmax(1)
+        count = np.cumsum(count, 1)
+        cost += BALANCE * part.cost * np.abs(2 * count / len(points) - 1)
+        k = np.arange(LAYERS)
+        thin = (k < MIN_LAYERS - 1) | (k > ends[:, None] - MIN_LAYERS)
+        cost[thin | (count < MIN_SHELL) | (count > len(points) - MIN_SHELL)] = np.inf
+        a, k = np.unravel_index(cost.argmin(), cost.shape)
+        if cost[a, k] == np.inf:
             return None
-        a, k = where
         under = _layers(self.cells[part.rows] @ axes.T, low, width)[:, a] <= k
-        return self.part(part.rows[under], part.empty), self.part(part.rows[~under], part.empty)
+        return (self.part(part.rows[under], part.empty, first[a, k]),
+                self.part(part.rows[~under], part.empty, last[a, LAYERS - 2 - k]))  # fmt: skip
 
 
 def _layers(along: np.ndarray, low: np.ndarray, width: np.ndarray) -> np.ndarray:
     return ((along - low) / width).astype(np.int64).clip(0, LAYERS - 1)
 
 
-def _hulls_of_layers(points: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (axes, LAYERS, d) of the first k + 1 layers along each axis, and of the last k + 1."""
+def _sums(layer: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Sums (axes, LAYERS) of the weights (axes, n) of points in these layers (axes, n)."""
+    row = layer + LAYERS * np.arange(len(layer))[:, None]
+    return np.bincount(row.ravel(), weight.ravel(), LAYERS * len(layer)).reshape(-1, LAYERS)
+
+
+def _hulls_of_layers(points: np.ndarray, layer: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Bounds (2, axes, LAYERS, d) of the first k + 1 layers along each axis, and of the last k + 1; `layer` (axes, n)
+    are those of the points (n, 3), and `count` (axes, LAYERS) is their number in each.
+    """
     extent = points @ BOUNDS.T
-    bounds = np.full((layer.shape[1], LAYERS, len(BOUNDS)), -np.inf, np.float32)
-    for a in range(layer.shape[1]):
-        order = layer[:, a].argsort(kind="stable")
-        present, start = np.unique(layer[order, a], return_index=True)
-        bounds[a, present] = np.maximum.reduceat(extent[order], start)
-    return np.maximum.accumulate(bounds, 1), np.maximum.accumulate(bounds[:, ::-1], 1)
+    bounds = np.full((2, *count.shape, len(BOUNDS)), -np.inf, np.float32)
+    for order, number, own in zip(layer.astype(np.uint8).argsort(1, kind="stable"), count, bounds[0], strict=True):
+        present = number > 0
+        start = np.cumsum(number, dtype=np.int64)[present] - number[present].astype(np.int64)
+        own[present] = np.maximum.reduceat(extent[order], start)
+    bounds[1] = bounds[0, :, ::-1]
+    return np.maximum.accumulate(bounds, 2)
 
 
 def _first_inside(bounds: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """The least k (axes, n) at which points of this extent (n, d) are within growing bounds (axes, k, d); else their
-    number.
+    """The least k (*b, n) at which points of this extent (n, d) are within growing bounds (*b, LAYERS, d); they are
+    within the last ones.
     """
-    axis = np.arange(len(bounds))[:, None]
-    low, high = (np.full((len(bounds), len(extent)), k) for k in (0, bounds.shape[1]))
-    while (low < high).any():
-        middle = (low + high) // 2
-        inside = (extent <= bounds[axis, np.minimum(middle, bounds.shape[1] - 1)] + 1e-3).all(-1)
-        low, high = np.where(inside, low, np.minimum(middle + 1, high)), np.where(inside, middle, high)
-    return low
+    flat = bounds.reshape(-1, bounds.shape[-1]) + 1e-3
+    at = np.arange(0, len(flat), LAYERS).reshape(*bounds.shape[:-2], 1)
+    out = np.zeros((*bounds.shape[:-2], len(extent)), np.int64)
+    step = LAYERS // 2
+    while step:
+        out += step * (flat.take(at + out + step - 1, 0) < extent).any(-1)
+        step //= 2
+    return out

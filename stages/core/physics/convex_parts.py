@@ -155,12 +155,14 @@ def _solid_moments(hull: ConvexHull) -> Moments:
 def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
     """The hull of each part: of the points of the surface at its voxels, and of its voxels that are away from these."""
     voxels, h, surface = solid.voxels, solid.h, solid.surface
-    of = np.append(part, -1)[cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]]
-    bare = cKDTree(surface).query(voxels, distance_upper_bound=h)[0] == np.inf
+    sample, voxel = _close(surface / h, voxels / h)
+    bare = np.ones(len(voxels), bool)
+    bare[voxel] = False
+    at = np.zeros((part.max() + 1, len(surface)), bool)
+    at[part[voxel], sample] = True
     deep = solid.depth > h * 3**0.5 / 2  # corners of the voxel are inside
     hulls = []
-    for k in range(part.max() + 1):
-        near = (of == k).any(1)
+    for k, near in enumerate(at):
         own = surface[near]
         mine = part == k
         inner = _corners(_extreme(voxels[deep & mine]), h), voxels[bare & mine]
@@ -170,6 +172,24 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
         else:
             hulls.append(_balanced(hull, own, solid.normals[near], h) if len(own) else hull)
     return hulls
+
+
+def _close(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of points (n, 3) and of unit voxels at cells (m, 3) that are less than 1 from each other."""
+    index = np.floor(cells).astype(np.int64)
+    low = index.min(0) - 1
+    row = np.full(index.max(0) - low + 2, -1)
+    row[tuple((index - low).T)] = np.arange(len(cells))
+    x = points - low - 0.5
+    first = np.floor(x).astype(np.int64).clip(0, np.array(row.shape) - 2)
+    pairs = []
+    for corner in np.ndindex(2, 2, 2):
+        at = first + corner
+        voxel = row[tuple(at.T)]
+        near = np.flatnonzero((voxel >= 0) & (((x - at) ** 2).sum(1) < 1))
+        pairs.append((near, voxel[near]))
+    point, voxel = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    return point, voxel
 
 
 def _extreme(points: np.ndarray) -> np.ndarray:

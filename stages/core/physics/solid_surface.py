@@ -66,6 +66,7 @@ class SolidSurface:
         At a flat face of exact samples the normals are then .2 degrees off, instead of 4 with the normals of voxels.
         """
         out = copy.copy(self)
+        vars(out).pop("_depth_grid", None)
         row = np.minimum(self._tree.query(self.points, NEIGHBOURS)[1], len(self.points) - 1)
         weight = ((self.normals[row] * self.normals[:, None]).sum(-1) > SAME_FACE).astype(float)
         middle = (weight[..., None] * self.points[row]).sum(1) / weight.sum(1, keepdims=True)
@@ -82,16 +83,25 @@ class SolidSurface:
         """Depths (k,) of points (k, 3) below the surface, negative outside."""
         out = self._coarse_depth(x)
         close = np.flatnonzero(np.abs(out) < 2 * self.h)
-        if len(close):
-            distance, row = self._tree.query(x[close], NEAREST)
-            row = np.minimum(row, len(self.points) - 1)
-            normals, below = self.normals[row], self.points[row] - x[close, None]
+        out[close] = self._fine_depth(x[close], out[close])
+        return out
+
+    def _fine_depth(self, x: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+        """Depths (k,) of points (k, 3) for which samples are looked up, from their depths in the voxels."""
+        out = coarse.copy()
+        distance, row = self._tree.query(x, distance_upper_bound=2 * self.h)
+        close = np.flatnonzero(distance < np.inf)
+        row = row[close]
+        height = ((self.points[row] - x[close]) * self.normals[row]).sum(1)
+        beside = distance[close] ** 2 - height**2  # squared distance of its projection to the nearest sample
+        known = close[beside < self.spacing**2]
+        if len(known):
+            x, coarse = x[known], coarse[known]
+            row = np.minimum(self._tree.query(x, NEAREST)[1], len(self.points) - 1)
+            normals = self.normals[row]
             agree = (normals * normals[:, :1]).sum(-1) > SAME_FACE
-            each = (below * normals).sum(-1)
-            fine = (each * agree).sum(1) / agree.sum(1)
-            beside = distance[:, 0] ** 2 - each[:, 0] ** 2  # squared distance of its projection to the nearest sample
-            known = (distance[:, 0] < 2 * self.h) & (beside < self.spacing**2)
-            out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
+            each = ((self.points[row] - x[:, None]) * normals).sum(-1)
+            out[known] = ((each * agree).sum(1) / agree.sum(1)).clip(coarse - self.h, coarse + self.h)
         return out
 
     def deeper_than(self, depth: float) -> np.ndarray:
@@ -105,9 +115,8 @@ class SolidSurface:
         """
         near = surrounded(self._full)
         x = (np.argwhere(near) + self._low + 0.5) * self.h
-        depth = self.depth(x)
-        inside = np.zeros_like(near)
-        inside[near] = depth >= 0
+        depth = self._depth_grid[near]
+        inside = near & (self._depth_grid >= 0)
         inside |= self._full & ~surrounded(inside)
         return x, depth, inside[near]
 
@@ -119,8 +128,14 @@ class SolidSurface:
 
     def depth_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Depths (x, y, z) below the surface at the centres of voxels in and around the body; the first centre."""
-        x = (np.indices(self._full.shape).reshape(3, -1).T + self._low + 0.5) * self.h
-        return self.depth(x).reshape(self._full.shape), x[0]
+        return self._depth_grid, (self._low + 0.5) * self.h
+
+    @cached_property
+    def _depth_grid(self) -> np.ndarray:
+        out = self._depth.copy()
+        close = np.abs(out) < 2 * self.h
+        out[close] = self._fine_depth((np.argwhere(close) + self._low + 0.5) * self.h, out[close])
+        return out
 
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
         return self._at(self._depth, x)

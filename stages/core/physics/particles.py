@@ -62,9 +62,8 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
     Raises InputError for an object without any usable Gaussian.
     """
-    clouds = parallel_map(lambda o: surface_points(scene, o.id, seed), scene.objects)
+    clouds, gaps = zip(*parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects), strict=True)
     photographed = scene.cameras is not None  # so the objects were at rest
-    gaps = parallel_map(_gap, clouds)
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
@@ -131,7 +130,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     direction = torch.nn.functional.normalize(torch.randn(len(of), 3, generator=rng, dtype=torch.float64), dim=1)
     local = 0.7 * torch.rand(len(of), 1, generator=rng, dtype=torch.float64).pow(1 / 3) * direction * scales[of]
     points = means[of] + (matrix(good.quats.double())[of] @ local[..., None])[..., 0]
-    return torch.cat([means, points]).numpy()
+    return np.asfortranarray(torch.cat([means, points]))
 
 
 def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
@@ -149,8 +148,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     There are about `along` voxels along its longest side, fewer where its surface is sampled too coarsely. Raises
     InputError for an object without any usable Gaussian.
     """
-    points = surface_points(scene, object_id, seed)
-    gap = _gap(points)
+    points, gap = _cloud(scene, object_id, seed)
     g = scene.gaussians.to("cpu")
     spacing = _spacing(g.means[(g.object_id == object_id) & usable(g)].double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
@@ -191,11 +189,16 @@ def _closed_body(
     margin = 6  # room for closing
     low = cells.min(0) - margin
     shape = np.minimum(cells.max(0) - low + 1 + margin, MAX_VOXELS_ALONG + 3 * margin)
+    cells -= low
+    kept = (cells < shape - margin).all(1)
+    if not kept.all():
+        points, cells = points[kept], cells[kept]
+    at = np.ravel_multi_index(tuple(cells.T), shape)
     shell = np.zeros(shape, bool)
-    shell[tuple((cells - low)[(cells - low < shape - margin).all(1)].T)] = True
+    shell.ravel()[at] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
     body = _largest(_fill(shell, bridge, standing))
-    body = _trim(body, points / h - low)
+    body = _trim(body, points / h - low - cells - 0.5, at)
     at = torch.from_numpy(np.argwhere(body)).float()
     extended = photographed and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
     if extended:
@@ -212,6 +215,13 @@ def _closed_body(
         body = dilated(np.pad(body, 1))
         low = low - 1
     return body, low, extended
+
+
+@cached_in_scene
+def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float]:
+    """`surface_points` of an object, and the gap between them."""
+    points = surface_points(scene, object_id, seed)
+    return points, _gap(points)
 
 
 def _spacing(means: Float[Tensor, "n 3"]) -> float:
@@ -293,18 +303,18 @@ def _outside(free: np.ndarray) -> np.ndarray:
     return kept[labels]
 
 
-def _trim(body: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _trim(body: np.ndarray, offset: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Remove outermost voxels of thick parts whose centre lies outside the surface.
 
-    Otherwise a body would grow by half a voxel all around. `points` on the surface are in voxels.
+    Otherwise a body would grow by half a voxel all around. Points on the surface are at `offset` (n, 3) from the
+    centres of the voxels `at` (n,) of the flat grid [voxels].
     """
-    cell = np.floor(points).astype(np.int64)
-    kept = ((cell >= 0) & (cell < body.shape)).all(1)
-    flat = np.ravel_multi_index(tuple(cell[kept].T), body.shape)
+    skin = _thick_skin(body)
+    some = skin.ravel()[at]
+    at, offset = at[some], offset[some]
     slope = np.gradient(ndimage.gaussian_filter(body.astype(np.float32), 1.0))  # points inward
-    depth = sum((points[kept, a] - cell[kept, a] - 0.5) * slope[a].ravel()[flat] for a in range(3))
-    inner = np.bincount(flat, depth, body.size).reshape(body.shape) > 0
-    return body & ~(_thick_skin(body) & inner)
+    depth = sum(offset[:, a] * slope[a].ravel()[at] for a in range(3))
+    return body & ~(skin & (np.bincount(at, depth, body.size).reshape(body.shape) > 0))
 
 
 def _thick_skin(body: np.ndarray) -> np.ndarray:

@@ -28,23 +28,27 @@ class ObservedSpace:
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
-    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views
+    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views or `weigh`
     device: str = "cpu"  # that renders; the maps are on the CPU
 
     @staticmethod
     @torch.no_grad()
-    def of(scene: Scene, device: str = "cpu") -> ObservedSpace:
-        """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative."""
+    def of(scene: Scene, device: str = "cpu", weigh: bool = True) -> ObservedSpace:
+        """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative.
+
+        With `weigh` also the weights of the Gaussians, which take as long.
+        """
         if scene.cameras is None or not len(scene.cameras):
             return ObservedSpace([], [], torch.zeros(0))
         views, maps, g = downscaled_views(scene.cameras), [], scene.gaussians.to(device)
-        weight = torch.zeros_like(g.opacities)
+        weight = torch.zeros(len(g) if weigh else 0, device=g.means.device)
         for viewmat, K, width, height in views:
             rendered = rasterise(g, viewmat[None], K[None], width, height)
             depth = torch.where(rendered.alpha[0] > MIN_OPAQUE_ALPHA, rendered.depth[0], 0.0)
             depth = torch.where(rendered.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0].cpu())
-            weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
+            if weigh:
+                weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
         return ObservedSpace(views, maps, weight.cpu(), device)
 
     def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:

@@ -102,6 +102,13 @@ def usable(g: Gaussians) -> Tensor:
     return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > MIN_PARTICLE_OPACITY)
 
 
+@cached_in_scene
+def usable_means(scene: Scene, object_id: int) -> Float[Tensor, "n 3"]:
+    """Centres of an object's usable Gaussians, on the CPU."""
+    mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
+    return mine.means[usable(mine)]
+
+
 def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     """Points (m, 3) sampled from an object's Gaussians within 0.7 standard deviations, without outliers.
 
@@ -149,8 +156,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     InputError for an object without any usable Gaussian.
     """
     points, gap = _cloud(scene, object_id, seed)
-    g = scene.gaussians.to("cpu")
-    spacing = _spacing(g.means[(g.object_id == object_id) & usable(g)].double())
+    spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     ways = (True, False) if _stands(points, h, scene.floor) else (False,)

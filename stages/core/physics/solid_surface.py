@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from stages.core.physics.morphology import surrounded
-from stages.core.physics.particles import filled_voxels, inliers, usable
+from stages.core.physics.particles import filled_voxels, inliers, usable_means
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
@@ -122,7 +122,8 @@ class SolidSurface:
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Points (s, 3) on the surface, one in each voxel that has any, and normals (s, 3), outwards."""
-        _, first = np.unique(np.floor(self.points / self.h), axis=0, return_index=True)
+        cells = np.floor(self.points / self.h).astype(np.int64) - self._low
+        _, first = np.unique(np.ravel_multi_index(tuple(cells.T), self._full.shape), return_index=True)
         points, normals = self.points[first], self.normals[first]
         return points + self.depth(points)[:, None] * normals, normals
 
@@ -148,8 +149,7 @@ class SolidSurface:
 def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
     """The surface of an object. Raises InputError for one without any usable Gaussian."""
     voxels, h = filled_voxels(scene, object_id, _voxels_along(scene, object_id), seed)
-    g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
-    means = g.means[usable(g)]
+    means = usable_means(scene, object_id)
     means = means[inliers(means)] if len(means) else means
     return SolidSurface(voxels.double().numpy(), h, means.double().numpy())
 

@@ -272,21 +272,21 @@ def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
     """
     if not walls.any():
         return walls
-    box = ndimage.find_objects(walls.view(np.uint8))[0]
-    room = leaks[-1] + 1  # margin, so that leaks lead outside and the faces of the grid are free
-    inner = np.pad(walls[box], room)
+    box = ndimage.find_objects(walls.view(np.uint8))[0]  # what is free on its faces is so further out too
+    inner = walls[box]
     away = squared_distances(inner, math.ceil(MIN_CAVITY_RATIO * leaks[-1]))
     filled = np.zeros_like(inner)
     for leak in leaks:
         free, wide = away > leak**2, away >= (MIN_CAVITY_RATIO * leak) ** 2
-        outside = _outside(free)
-        hollow = free & ~outside & ~filled
+        hollow = free & ~_outside(free) & ~filled
         if (hollow & wide).any():
             hollow = _components_with(hollow, wide)
-            # grow back to the walls, but not through the leaks
-            filled |= _components_with(~inner & (squared_distances(outside, leak + 1) > (leak + 1) ** 2), hollow)
+            room = leak + 1  # margin, beyond which all is free
+            outside = _outside(squared_distances(np.pad(inner, room), leak) > leak**2)
+            from_outside = squared_distances(outside, room)[room:-room, room:-room, room:-room]
+            filled |= _components_with(~inner & (from_outside > room**2), hollow)  # to the walls, not through the leaks
     out = np.zeros_like(walls)
-    out[box] = filled[room:-room, room:-room, room:-room]
+    out[box] = filled
     return out
 
 

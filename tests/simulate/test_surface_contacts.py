@@ -143,6 +143,16 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     assert len(top) > 1000 and np.abs(top[:, 2] - 0.25).max() < 0.003
 
 
+def test_depths_on_the_grid_are_those_at_its_nodes():
+    line = 0.1 * np.arange(-4, 4.5)
+    slab = np.stack(np.meshgrid(line, line, line[2:-2], indexing="ij"), -1).reshape(-1, 3)
+    body = SolidSurface(slab + 0.05, 0.1, box((0.9, 0.9, 0.5), 0.03).points.double().numpy() + 0.06)
+    for surface in (body, body.fitted):
+        depth, low = surface.depth_grid()
+        nodes = low + 0.1 * np.indices(depth.shape).reshape(3, -1).T
+        assert np.abs(depth.ravel() - surface.depth(nodes)).max() < 1e-9
+
+
 def test_voxels_around_a_symmetric_body_are_symmetric():
     """A slab of 9 x 9 x 5 voxels of edge .1 and points on its faces: one voxel around it, and itself inside."""
     line = 0.1 * np.arange(-4, 4.5)

@@ -66,7 +66,7 @@ class SolidSurface:
         At a flat face of exact samples the normals are then .2 degrees off, instead of 4 with the normals of voxels.
         """
         out = copy.copy(self)
-        vars(out).pop("_depth_grid", None)
+        vars(out).pop("_depth_grid", None)  # of the other samples
         row = np.minimum(self._tree.query(self.points, NEIGHBOURS)[1], len(self.points) - 1)
         weight = ((self.normals[row] * self.normals[:, None]).sum(-1) > SAME_FACE).astype(float)
         middle = (weight[..., None] * self.points[row]).sum(1) / weight.sum(1, keepdims=True)

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import ConvexHull, Delaunay
 
 from stages.core.geometry.cameras import orbit
-from stages.core.physics.convex_cuts import Part
+from stages.core.physics.convex_cuts import LAYERS, Part, _first_inside
 from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import concatenate
@@ -233,3 +233,11 @@ def test_parts_of_a_shell_follow_its_inner_surface():
         first = np.where(enter <= leave, np.minimum(first, enter), first)
     h = 2 * outer / 48
     assert abs(np.median(first) - inner) < h / 3 and first.min() > inner - h
+
+
+def test_points_are_first_inside_the_bounds_that_bisection_finds():
+    rng = np.random.default_rng(0)
+    bounds = np.maximum.accumulate(rng.random((2, 3, LAYERS, 4), np.float32), 2)
+    extent = rng.random((50, 4), np.float32) * bounds[..., -1, :].min((0, 1))
+    inside = (extent[:, None] <= bounds[:, :, None] + 1e-3).all(-1)
+    assert np.array_equal(_first_inside(bounds, extent), inside.argmax(-1))

@@ -31,6 +31,15 @@ def grid(*sides, step):
     return torch.from_numpy(block(*sides) * float(step)).float()
 
 
+def test_points_are_close_to_voxels_whose_centre_is_less_than_an_edge_away():
+    rng = np.random.default_rng(0)
+    cells = block(4, 3, 5, low=(-2, 1, 0))[::2] + 0.5
+    points = rng.uniform(-4, 7, (500, 3))
+    found = np.zeros((len(points), len(cells)), bool)
+    found[convex_parts._close(points, cells)] = True
+    assert np.array_equal(found, np.linalg.norm(points[:, None] - cells, axis=-1) < 1) and found.any()
+
+
 def test_spacing_is_the_median_distance_to_the_nearest_other():
     line = torch.tensor([0.0, 1.0, 3.0, 7.0, 15.0])[:, None] * torch.tensor([[0.6, 0.8, 0.0]])
     assert particles._spacing(line) == pytest.approx(2.0)  # 1, 1, 2, 4, 8

@@ -110,7 +110,7 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
     other = _motion(scene, keypoints, case.other, case.materials, simulate)
     rmse = [float((_motion(scene, keypoints, case.other, m, simulate) - other).square().sum(-1).mean().sqrt())
             for m in (fit.problem.materials, found)]  # fmt: skip
-    return {"rows": _rows(fit, case), "default_rmse": rmse[0], "fitted_rmse": rmse[1], "fit_rmse": fit.rmse[1],
+    return {"rows": errors_of(fit, case), "default_rmse": rmse[0], "fitted_rmse": rmse[1], "fit_rmse": fit.rmse[1],
             "motions": fit.evaluations, "seconds": round(fit.seconds, 1)}  # fmt: skip
 
 
@@ -123,17 +123,18 @@ def _motion(scene, keypoints: Keypoints, prompts: ForcePrompts, materials: dict[
         return torch.stack([state.positions for state in states])
 
 
-def _rows(fit: Fit, case: FitCase) -> list[dict]:
+def errors_of(fit: Fit, case: FitCase) -> list[dict]:
     """Each material constant that was searched: its error, half width, and whether it is identifiable.
 
-    Densities are compared as ratios to the first object's, which stays as it is.
+    Densities and stiffness are compared as ratios to the density of the first object, which stays as it is: a motion
+    does not tell a common factor.
     """
     ratio = fit.problem.materials[1].density / case.materials[1].density
     rows = []
     for k, p in enumerate(fit.problem.parameters):
         if p.name in AXES:
             continue
-        true = getattr(case.materials[p.object_id], p.name) * (ratio if p.name == "density" else 1.0)
+        true = getattr(case.materials[p.object_id], p.name) * (ratio if p.name in ("density", "E") else 1.0)
         true = math.log10(true) if QUANTITIES[p.name].log else true
         rows.append({"object": p.object_id, "quantity": p.name, "identifiable": fit.is_identifiable(k), "true": true,
                      "error": fit.value(k) - true, "half_width": fit.half_width(k)})  # fmt: skip

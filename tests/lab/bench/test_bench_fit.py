@@ -1,9 +1,12 @@
 """The benchmark of materials from motion: its scenes, its summary, and one scene from end to end."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 
 from stages.core.errors import InputError
-from stages.lab.bench.fit import KINDS, FitBenchOptions, fit_case, measure, summary
+from stages.lab.bench.fit import KINDS, FitBenchOptions, errors_of, fit_case, measure, summary
 
 
 def test_scenes_are_drawn_by_seed_and_index():
@@ -30,6 +33,22 @@ def test_the_summary_counts_what_is_shown():
         "friction: 2 of 3 identifiable, median error 0.175, largest 0.300; 1 within 0.1",
         "another motion: RMSE over that by default 0.50 (median), 1 of 2 halved",
     ]
+
+
+def test_stiffness_and_density_are_compared_relative_to_the_first_density():
+    case, names = fit_case(0, "soft", 3), ("density", "E", "friction")
+    true = case.materials[1]
+    doubled = {
+        "density": math.log10(2 * true.density),
+        "E": math.log10(2 * true.E),
+        "friction": true.friction,
+    }  # the same motion
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(parameters=[SimpleNamespace(name=name, object_id=1) for name in names],
+                                materials={1: SimpleNamespace(density=2 * true.density)}),
+        is_identifiable=lambda k: True, value=lambda k: doubled[names[k]], half_width=lambda k: 0.1,
+    )  # fmt: skip
+    assert [row["error"] for row in errors_of(fit, case)] == pytest.approx([0, 0, 0], abs=1e-9)
 
 
 @pytest.mark.slow

@@ -37,6 +37,14 @@ def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"
     return normals, (normals * a).sum(1)
 
 
+def _count_within(
+    points: Float[Tensor, "n 3"], normals: Float[Tensor, "k 3"], offsets: Float[Tensor, "k"], threshold: float
+) -> Float[Tensor, "k"]:
+    """Number of points within `threshold` of each plane; in place, with so few planes that the caches hold them all."""
+    distance = (points @ normals.mT).sub_(offsets).abs_()
+    return torch.lt(distance, threshold, out=distance).sum(0)
+
+
 def ransac(
     points: Float[Tensor, "n 3"],
     threshold: float,
@@ -66,11 +74,9 @@ def ransac(
     if not good.any():
         return None
     normals, offsets = normals[good], offsets[good]
-    score = torch.cat([
-        ((points[sample] @ n.mT - d).abs() < threshold).double().mean(0)
-        for n, d in zip(normals.split(256), offsets.split(256), strict=True)
-    ])  # fmt: skip  # sampled by weight, so the count is weighted
-    best = int(score.argmax())
+    drawn = points[sample]  # by weight, so their number is weighted
+    counts = [_count_within(drawn, n, d, threshold) for n, d in zip(normals.split(64), offsets.split(64), strict=True)]
+    best = int(torch.cat(counts).argmax())
     plane = Plane(normals[best], float(offsets[best]))
     for _ in range(3):
         inside = plane.heights(points).abs() < threshold

@@ -1,5 +1,7 @@
 """Realistic photo sets: cameras are found, or the error says what to change."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 
@@ -8,8 +10,16 @@ from stages.core.geometry.cameras import centres, intrinsics, orbit
 from stages.core.geometry.similarity import umeyama
 from stages.core.scene.cameras import Cameras
 from stages.reconstruct import sfm
+from stages.reconstruct.colmap import colmap_process
 from stages.reconstruct.photos import Photos
 from tests.reconstruct.raycast import arc, photograph, rays_of, texture, with_mirror
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_process() -> Iterator[None]:
+    """COLMAP's process, of which each test would else start one."""
+    with colmap_process():
+        yield
 
 
 def as_photos(images: list[torch.Tensor], names: tuple[str, ...], folder) -> Photos:

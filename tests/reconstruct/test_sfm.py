@@ -1,6 +1,7 @@
 """Structure from motion: its parts, and its errors."""
 
 import sys
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -10,11 +11,19 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import umeyama
 from stages.core.scene.cameras import LensDistortion
 from stages.reconstruct import features, sfm
+from stages.reconstruct.colmap import colmap_process
 from stages.reconstruct.matching import MatchingOptions
 from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import Photos, undistort
 from tests.reconstruct import raycast
 from tests.reconstruct.raycast import arc, photograph, write_set
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_process() -> Iterator[None]:
+    """COLMAP's process, of which each test would else start one."""
+    with colmap_process():
+        yield
 
 
 def as_photos(cameras, folder) -> Photos:

@@ -19,7 +19,7 @@ def without_labels(scene: Scene) -> Scene:
 
 
 def test_objects_apart_on_a_table_are_found():
-    scene = three_apart(side=0.7)
+    scene = three_apart(side=0.56)
     found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
     overlaps = best_overlap(found, scene.gaussians.object_id)
     assert min(overlaps.values()) > 0.85, overlaps
@@ -30,13 +30,13 @@ def test_an_object_that_fills_the_photos_is_one():
     r = 0.4
     body = [egg((0, 0, r), (0.5 * r, 0.4 * r, r), (0.8, 0.1, 0.1), 1, 3000),
             egg((0.5 * r, 0, 1.2 * r), (0.5 * r, 0.2 * r, 0.2 * r), (0.8, 0.1, 0.1), 1)]  # fmt: skip
-    scene = scene_of(table_gaussians(side=0.8, spacing=0.025), *body)
+    scene = scene_of(table_gaussians(side=0.65, spacing=0.025), *body)
     found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
     assert best_overlap(found, scene.gaussians.object_id)[1] > 0.9
 
 
 def test_a_bare_table_has_no_objects():
-    assert not segment(scene_of(table_gaussians(side=0.7)), SegmentOptions(backend="learned")).objects
+    assert not segment(scene_of(table_gaussians(side=0.5)), SegmentOptions(backend="learned")).objects
 
 
 def test_weights_that_do_not_exist_are_named(tmp_path):

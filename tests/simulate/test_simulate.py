@@ -274,8 +274,10 @@ def test_doubled_resolution_keeps_bodies_on_the_floor(file):
 
 
 def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path, monkeypatch):
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes a second
-    scene = three_apart(side=0.7, noise=0.002)
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
+    scene = three_apart(side=0.56, noise=0.002)
     blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
     write_scene(tmp_path / "scene.ply", replace(scene, gaussians=blank))
     segment(tmp_path / "scene.ply", tmp_path / "labelled.ply")

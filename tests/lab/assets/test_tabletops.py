@@ -111,7 +111,9 @@ def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path,
 
 def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes a second
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
     monkeypatch.setattr(bench_segment, "tabletop", cache(tabletop))
 
     def perfect(photos, out, options):

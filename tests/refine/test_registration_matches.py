@@ -70,7 +70,14 @@ def test_points_of_a_view_are_on_the_object():
     assert (radius - 1).abs().median() < 0.03
 
 
-def test_matches_by_colour_give_the_place():
+@pytest.fixture
+def few_renderings(monkeypatch):
+    """24 instead of 90."""
+    monkeypatch.setattr(registration_matches, "YAWS", 12)
+    monkeypatch.setattr(registration_matches, "PITCHES", (9.0, 27.0))
+
+
+def test_matches_by_colour_give_the_place(few_renderings):
     true = Similarity(1.7, torch.eye(3), torch.tensor([0.3, -0.2, 0.1]))
     whole = painted_egg()
     found = matched_place(Matcher(ColourFeatures(), NearestColour()), seen_from(transformed(whole, true)), whole)

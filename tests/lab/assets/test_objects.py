@@ -85,13 +85,13 @@ def mean_colour(g: Gaussians, mask: torch.Tensor) -> list[float]:
     return (g.sh[mask, 0].mean(0) * C0 + 0.5).tolist()
 
 
-def test_registry_holds_the_published_ids_scales_and_materials():
+def test_registry_holds_the_published_ids_scales_and_materials(made_of_few):
     rows = {o.id: (o.name, o.scale, o.E, o.density) for o in OBJECTS.values()}
     assert sorted(rows) == [0, 2, 3, 4, 7, 9, 10, 11, 12, 14]
     assert rows[11] == ("phone", 0.4, 2e7, 2600.0)
     assert rows[7] == ("duck", 0.3, 3e5, 300.0)
     assert OBJECTS["cloth"].prompt == "a yellow t-shirt with an owl"
-    can = full_size("can").means
+    can = make_object("can").means
     assert (can.amax(0) - can.amin(0)).max() == pytest.approx(0.4)
 
 

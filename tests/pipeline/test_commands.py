@@ -104,7 +104,9 @@ def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
     """Each on the output of the one before, on a named device."""
     draft = dataclasses.replace(QUALITY_PRESETS["draft"], gaussians=2000)
     monkeypatch.setitem(QUALITY_PRESETS, "draft", draft)
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes time
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
     cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
     scene, labelled, refined, motion = (tmp_path / name for name in ("a.ply", "b.ply", "c.ply", "t.h5"))
     quick = "--quality", "draft"

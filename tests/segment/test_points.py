@@ -29,7 +29,7 @@ def at(scene: Scene, number: int, view: int, name: str) -> str:
 
 def test_the_objects_at_the_points_are_found_with_their_names(device, monkeypatch):
     monkeypatch.setattr(clicks, "SCALES", SCALES[:2])  # of three, each of which takes a second
-    scene = three_apart(side=0.7)
+    scene = three_apart(side=0.56)
     points = at(scene, 3, 0, "green tower"), at(scene, 1, 4, "brick")
     found = segment(unlabelled(scene), SegmentOptions(points=points, device=device))
     assert [(o.id, o.name) for o in found.objects] == [(1, "green tower"), (2, "brick")]
@@ -40,7 +40,7 @@ def test_the_objects_at_the_points_are_found_with_their_names(device, monkeypatc
 
 def test_points_of_one_name_are_on_one_object(monkeypatch):
     monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # of three, each of which takes a second
-    scene = three_apart(side=0.7)
+    scene = three_apart(side=0.56)
     points = at(scene, 2, 0, "egg"), at(scene, 2, 5, "egg")
     found = segment(unlabelled(scene), SegmentOptions(points=points))
     assert [o.name for o in found.objects] == ["egg"]
@@ -49,8 +49,8 @@ def test_points_of_one_name_are_on_one_object(monkeypatch):
 
 def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog, monkeypatch):
     monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # of three, each of which takes a second
-    scene = three_apart(side=0.7)
-    corner = torch.tensor([[-0.3, 0.3, 0.0]])  # of the table
+    scene = three_apart(side=0.56)
+    corner = torch.tensor([[-0.26, 0.26, 0.0]])  # of the table
     x, y = project(corner, scene.cameras.viewmats[0], scene.cameras.Ks[0])[0].tolist()
     nothing = f"xy={x:.0f},{y:.0f}"
     found = segment(unlabelled(scene), SegmentOptions(points=(nothing, at(scene, 2, 0, "egg"))))

@@ -93,7 +93,7 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
 
 def test_friction_is_found_from_near_and_its_uncertainty_is_small(slide, device):
     """By Levenberg and Marquardt's method alone; the slide shows nothing of the rebound."""
-    problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, frames=14))
     true = {"friction": 0.3, "loss": problem.materials[1].loss, "x": 2.0, "y": 0.5}
     exact = np.array([p.coordinate(true[p.name]) for p in problem.parameters])
     with simulations(problem, 1) as sims:
@@ -134,12 +134,12 @@ def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
 def test_cma_es_comes_nearer_from_far_away(slide, device, monkeypatch):
     monkeypatch.setattr(search, "GENERATIONS", 5)
-    options = replace(OPTIONS, frames=12)
+    options = replace(OPTIONS, frames=8)
     problem = read_problem(slide / "scene.ply", slide / "track.h5", options)
     far = np.array([0.9, 0.5, 0.6, 0.4])
     with simulations(problem, 1) as sims:
-        near = _evolve(sims, 12, far, Estimate(far, np.eye(4) / 4), 0, options)
-        before, after = sims.costs([far, near], 12)
+        near = _evolve(sims, 8, far, Estimate(far, np.eye(4) / 4), 0, options)
+        before, after = sims.costs([far, near], 8)
     assert after < before / 2
 
 

@@ -44,11 +44,12 @@ def refine_outlines(
     views = torch.linspace(0, count - 1, min(MAX_VIEWS, count)).round().long().tolist()
     numbers = ids[ids > 0].unique().tolist()
     middles = torch.stack([means[ids == number].nanmedian(0).values for number in numbers])
+    own = (ids[:, None] == torch.tensor(numbers)).float().to(device)
     drawn, votes = replace(scene, gaussians=scene.gaussians.to(device)), torch.zeros(len(ids), 1, device=device)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         found = []
         for view in views:
-            footprint, labels = ViewFootprint.of(drawn, view), _label_image(drawn, view, ids, numbers)
+            footprint, labels = ViewFootprint.of(drawn, view), _label_image(drawn, view, own, numbers)
             image = (255 * footprint.image.cpu().numpy()).round().astype(np.uint8)
             bands = dict(zip(numbers, _bands(scene, view, middles), strict=True))
             found.append((footprint, pool.submit(cut_outlines, image, labels, bands, seed)))
@@ -62,10 +63,12 @@ def refine_outlines(
     return voted
 
 
-def _label_image(scene: Scene, view: int, ids: Int[Tensor, "n"], numbers: list[int]) -> Int[np.ndarray, "h w"]:
-    """The object with the largest weight in each pixel at the resolution of voting; 0: the background."""
+def _label_image(scene: Scene, view: int, own: Float[Tensor, "n k"], numbers: list[int]) -> Int[np.ndarray, "h w"]:
+    """The object with the largest weight in each pixel at the resolution of voting; 0: the background.
+
+    `own` is 1 for the Gaussians of each of the objects `numbers`.
+    """
     width, height, K = voting_intrinsics(scene, view)
-    own = (ids[:, None] == torch.tensor(numbers)).float()
     weight = rasterise_features(scene.gaussians, own, scene.cameras.viewmats[[view]], K[None], width, height)[0]
     most, which = weight.max(-1)
     return torch.where(most > 1 - weight.sum(-1), torch.tensor(numbers, device=most.device)[which], 0).cpu().numpy()

@@ -16,7 +16,7 @@ from stages.core.geometry.cameras import resize as resize_K
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import find_support
-from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.raster.rasterise import rasterise_with_index
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
@@ -43,15 +43,14 @@ class ViewFootprint:
         """The footprint of view number `view`, rendered on the device of the Gaussians."""
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = voting_intrinsics(scene, view)
-        front, weight = visibility(g, viewmat, K, width, height)
-        rendered = rasterise(g, viewmat[None], K[None], width, height)
+        rgb, _, depth, front, weight = rasterise_with_index(g, viewmat, K, width, height)
         viewmat, K = viewmat.to(g.means), K.to(g.means)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
         z = depths(g.means, viewmat)
         inside = torch.nonzero((z > 0.01) & (x >= 0) & (x < width) & (y >= 0) & (y < height))[:, 0]
         pixels = y[inside] * width + x[inside]
-        on = (z[inside] - rendered.depth[0].flatten()[pixels]).abs() < SURFACE_TOLERANCE * z[inside]
-        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), rendered.rgb[0].clamp(0, 1))
+        on = (z[inside] - depth.flatten()[pixels]).abs() < SURFACE_TOLERANCE * z[inside]
+        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), rgb.clamp(0, 1))
 
     def votes(self, labels: Int[Tensor, "h2 w2"]) -> Float[Tensor, "n k"]:
         """Votes of a label image of any size: for each Gaussian and label, the weight of its pixels.

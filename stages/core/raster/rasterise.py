@@ -21,7 +21,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import degree_of
 from stages.core.kernels.interop import kernel_device
 from stages.core.kernels.splat.binning import Bins, bin_splats
-from stages.core.kernels.splat.compositing import composite, dominant_splats
+from stages.core.kernels.splat.compositing import composite, composite_with_dominant, dominant_splats
 from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.kernels.splat.tiles import Capacity, Tiles, bin_tiles
 from stages.core.scene.gaussians import Gaussians
@@ -129,13 +129,12 @@ def rasterise_with_index(
     K: Float[Tensor, "3 3"],
     width: int,
     height: int,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """One view over black, projected once: rgb, alpha and depth as in `Rendering`, and the index of `visibility`."""
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Int[Tensor, "h w"], Float[Tensor, "n"]]:
+    """One view over black, drawn once: rgb, alpha and depth as in `Rendering`, and index and weight of `visibility`."""
     g = _drawable(gaussians)
     splats, bins = _splats(g, _View(viewmat, K, width, height).packed(g), width, height)
-    rgb, depth, alpha = composite(splats, bins, None, mean=True)
-    index, _ = dominant_splats(splats, bins)
-    return tuple(x.to(gaussians.means.device) for x in (rgb, alpha, depth, index))
+    rgb, depth, alpha, index, weight = composite_with_dominant(splats, bins)
+    return tuple(x.to(gaussians.means.device) for x in (rgb, alpha, depth, index, weight))
 
 
 def _drawable(g: Gaussians) -> Gaussians:

@@ -105,7 +105,7 @@ class Synthesiser:
     def draw(self, camera: Camera, poses: Poses, reduction: int = 1) -> Synthesis:
         """What a camera sees of the objects at these poses, at a whole fraction of its resolution."""
         g, (width, height) = self.objects(poses), camera.size
-        rgb, alpha, depth, index = rasterise_with_index(g, camera.viewmat, camera.K, width, height)
+        rgb, alpha, depth, index, _ = rasterise_with_index(g, camera.viewmat, camera.K, width, height)
         image, front = camera.in_front(rgb, alpha, depth)
         seen = front & (alpha > MIN_ALPHA) & (index >= 0)
         label = torch.where(seen, self.row[index.clamp_min(0)], -1)

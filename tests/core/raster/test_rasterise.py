@@ -239,11 +239,11 @@ def test_features_are_composited_like_colours(device, count):
 @pytest.mark.parametrize("device", devices)
 def test_one_projection_gives_image_and_index(device):
     gaussians = random_gaussians(300).to(device)
-    rgb, alpha, depth, index = rasterise_with_index(gaussians, EYE, K, SIZE, SIZE)
+    rgb, alpha, depth, index, weight = rasterise_with_index(gaussians, EYE, K, SIZE, SIZE)
     shot = draw(gaussians)
     for found, separate in ((rgb, shot.rgb[0]), (alpha, shot.alpha[0]), (depth, shot.depth[0])):
         torch.testing.assert_close(found, separate)
-    assert torch.equal(index, visibility(gaussians, EYE, K, SIZE, SIZE)[0])
+    assert all(map(torch.equal, (index, weight), visibility(gaussians, EYE, K, SIZE, SIZE)))
 
 
 @pytest.mark.parametrize("device", devices)

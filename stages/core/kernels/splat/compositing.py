@@ -191,13 +191,18 @@ def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, 
 
 def dominant_splats(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor]:
     """The splat with the largest weight in each pixel (h, w; -1: none), and each splat's total weight (n,) [px]."""
+    return composite_with_dominant(splats, bins)[3:]
+
+
+def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`composite` over black with `mean`, and `dominant_splats`, in one pass. Not differentiable."""
     if splats.is_cuda:
-        return compositing_cuda.dominant_splats(splats, bins)
-    index = torch.empty(bins.height, bins.width, dtype=torch.int32)
+        return compositing_cuda.composite_with_dominant(splats, bins)
+    index, state = torch.empty(bins.height, bins.width, dtype=torch.int32), _outputs(bins)
     totals = torch.zeros(len(bins.members))  # of each pair of bin and splat
-    arguments = _arguments(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals)
+    arguments = _arguments(splats, bins, torch.zeros(3), True, *state, index, totals)
     launch_ranges(_dominant, bins.balanced_bounds(4 * num_threads()), arguments)
-    return index.long(), torch.bincount(bins.members, totals, len(splats)).float()
+    return *state[3:], index.long(), torch.bincount(bins.members, totals, len(splats)).float()
 
 
 def composite_reference(

@@ -308,15 +308,15 @@ class Composite(torch.autograd.Function):
         return draw_adjoint(splats, ctx.tiles, behind, ctx.mean, *state, *upstream), None, None, None
 
 
-def dominant_splats(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tensor]:
-    """As `compositing.dominant_splats`, for splats and tiles on a CUDA device.
+def composite_with_dominant(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """As `compositing.composite_with_dominant`, for splats and tiles on a CUDA device.
 
     A splat's total weight is the derivative of the sum over all pixels of a colour channel by the splat's colour.
     """
     behind = splats.new_zeros(3)
-    rgb, fourth, alpha, left, stops, dominant = draw(splats, tiles, behind, False)
+    rgb, fourth, alpha, left, stops, dominant = draw(splats, tiles, behind, True)
     v_rgb = torch.zeros_like(rgb)
     v_rgb[..., 0] = 1
     none = torch.zeros_like(alpha)
-    grads = draw_adjoint(splats, tiles, behind, False, left, stops, fourth, alpha, v_rgb, none, none)
-    return dominant.long(), grads[:, 6].contiguous()
+    grads = draw_adjoint(splats, tiles, behind, True, left, stops, fourth, alpha, v_rgb, none, none)
+    return rgb, fourth, alpha, dominant.long(), grads[:, 6].contiguous()

@@ -150,9 +150,7 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
     sums, top = tree.sums(leaves), tree.maxima(corners)
     n, mean = sums[:, 0], sums / sums[:, :1]
     links = np.stack([tree.link_sum, tree.link_count], 1)
-    inner = np.concatenate([np.zeros((tree.count, 2)), links])  # sum and number of the links inside each node
-    for node, (a, b) in enumerate(tree.children.tolist(), tree.count):
-        inner[node] += inner[a] + inner[b]
+    inner = tree.sums_within(links)  # sum and number of the links inside each node
     border = sums[:, -2:] - 2 * inner
     merged = np.concatenate([np.zeros(tree.count), links[:, 0] / np.maximum(links[:, 1], 1)])
     parents, sibling = tree.parents(), np.zeros(len(tree))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,25 +34,50 @@ class MergeTree:
         out[self.children] = np.arange(self.count, len(self))[:, None]
         return out
 
+    @cached_property
+    def _ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The leaves (count,) in an order in which those of each node are consecutive; first and last + 1 of each."""
+        children, size = self.children.tolist(), [1] * self.count
+        for a, b in children:
+            size.append(size[a] + size[b])
+        sizes, roots = np.array(size, dtype=np.int64), self.parents() < 0
+        start = np.zeros(len(self), np.int64)
+        start[roots] = np.cumsum(sizes[roots]) - sizes[roots]
+        first = start.tolist()
+        for node in range(len(self) - 1, self.count - 1, -1):
+            a, b = children[node - self.count]
+            first[a], first[b] = first[node], first[node] + size[a]
+        start = np.array(first, dtype=np.int64)
+        return start[: self.count].argsort(), start, start + sizes
+
     def sums(self, leaves: np.ndarray) -> np.ndarray:
-        """(nodes, d) sums over the leaves of each node, of values (count, d) in float64."""
-        return self._accumulated(leaves.astype(np.float64), np.add)
+        """(nodes, d) sums over the leaves of each node, of values (count, d), in float64."""
+        order, first, last = self._ranges
+        return _between(leaves[order], first, last)
+
+    def sums_within(self, merges: np.ndarray) -> np.ndarray:
+        """(nodes, d) sums over the merges inside each node, itself included, of values (m, d), in float64."""
+        _, first, last = self._ranges
+        at = np.zeros((self.count, merges.shape[1]))
+        at[first[self.children[:, 1]]] = merges  # between the leaves of the two
+        return _between(at, first + 1, last)
 
     def maxima(self, leaves: np.ndarray) -> np.ndarray:
-        """(nodes, d) largest values of the leaves of each node."""
-        return self._accumulated(leaves.astype(np.float64), np.maximum)
-
-    def _accumulated(self, leaves: np.ndarray, combine: np.ufunc) -> np.ndarray:
-        out = np.concatenate([leaves, np.zeros((len(self.children), *leaves.shape[1:]))])
-        for node, (a, b) in enumerate(self.children.tolist(), self.count):
-            combine(out[a], out[b], out=out[node])
+        """(nodes, d) largest values of the leaves of each node, of (count, d)."""
+        order, first, last = self._ranges
+        out, window, width = np.empty((len(self), leaves.shape[1])), leaves[order], 1  # maxima of `width` from each on
+        while len(window):
+            fit = (last - first >= width) & (last - first < 2 * width)
+            out[fit] = np.maximum(window[first[fit]], window[last[fit] - width])
+            window, width = np.maximum(window[:-width], window[width:]), 2 * width
         return out
 
     def best(self, scores: np.ndarray) -> np.ndarray:
         """The disjoint nodes with the largest sum of positive `scores` (nodes,)."""
-        value = np.maximum(scores, 0.0)
-        for node, (a, b) in enumerate(self.children.tolist(), self.count):
-            value[node] = max(scores[node], value[a] + value[b])
+        scores, children = scores.tolist(), self.children.tolist()
+        value = [max(score, 0.0) for score in scores[: self.count]]
+        for score, (a, b) in zip(scores[self.count :], children, strict=True):
+            value.append(max(score, value[a] + value[b]))
         chosen, stack = [], np.nonzero(self.parents() < 0)[0].tolist()
         while stack:
             node = stack.pop()
@@ -60,17 +86,25 @@ class MergeTree:
             if scores[node] >= value[node]:
                 chosen.append(node)
             else:
-                stack.extend(self.children[node - self.count].tolist())
+                stack.extend(children[node - self.count])
         return np.array(sorted(chosen), dtype=np.int64)
 
     def labels(self, nodes: np.ndarray) -> np.ndarray:
         """(count,) the place in `nodes`, which are disjoint, of the one that holds each leaf; -1 for none."""
-        out = np.full(len(self), -1)
-        out[nodes] = np.arange(len(nodes))
-        for node in range(len(self) - 1, self.count - 1, -1):
-            if out[node] >= 0:
-                out[self.children[node - self.count]] = out[node]
-        return out[: self.count]
+        order, first, last = self._ranges
+        out = np.full(self.count, -1)
+        for place, node in enumerate(nodes):
+            out[order[first[node] : last[node]]] = place
+        return out
+
+
+def _between(values: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """(k, d) sums of values (n, d) from `first` up to before `last`."""
+    total = np.zeros((len(values) + 1, values.shape[1]))
+    np.cumsum(values, axis=0, out=total[1:])
+    out = total[last]
+    out -= total[first]
+    return out
 
 
 def merge_tree(count: int, pairs: np.ndarray, weights: np.ndarray) -> MergeTree:

@@ -48,15 +48,19 @@ def test_random_graphs_merge_as_by_brute_force(seed):
 def test_parts_without_an_edge_between_them_stay_apart():
     tree = merge_tree(5, np.array([[0, 1], [3, 4]]), np.array([1.0, -2.0]))
     assert sorted(len(s) for s, p in zip(leaves_of(tree), tree.parents(), strict=True) if p < 0) == [1, 2, 2]
-    empty = merge_tree(3, np.zeros((0, 2), np.int64), np.zeros(0))
+    nothing = np.zeros((0, 2), np.int64), np.zeros(0)
+    empty = merge_tree(3, *nothing)
     assert len(empty) == 3 and empty.sums(np.ones((3, 2))).shape == (3, 2)
+    assert merge_tree(0, *nothing).maxima(np.ones((0, 2))).shape == (0, 2)
 
 
 def test_sums_and_maxima_are_those_of_the_leaves():
     rng = np.random.default_rng(3)
     tree = merge_tree(20, *random_graph(rng, 20, 60))
-    values = rng.normal(size=(20, 2))
+    values, merges = rng.normal(size=(20, 2)), rng.normal(size=(len(tree.children), 2))
     for node, leaves in enumerate(leaves_of(tree)):
+        inside = [i for i, s in enumerate(leaves_of(tree)[20:]) if s <= leaves]
+        np.testing.assert_allclose(tree.sums_within(merges)[node], merges[inside].sum(0), atol=1e-12)
         np.testing.assert_allclose(tree.sums(values)[node], values[list(leaves)].sum(0))
         np.testing.assert_allclose(tree.maxima(values)[node], values[list(leaves)].max(0))
 

@@ -218,7 +218,7 @@ def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[Sc
     """Object of each surfel, 0 for none, after the cut along the outlines of the objects `labels`."""
     chance = torch.stack([s.chance for s in scored]).nanmean(0)
     fine = surfels.enlarged(SCALES[-1])
-    grid = voxelise(fine)
+    grid = voxelise(fine, features=False)
     return cut_outlines(fine, grid, *_by_voxel(grid, labels, chance))
 
 

@@ -82,13 +82,16 @@ def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> 
     return matrix(quats)[torch.arange(len(quats)), :, scales.argmin(1)]
 
 
-def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None) -> VoxelGrid:
-    """The voxels of a scene; `shift` moves the grid, for training."""
+def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None, features: bool = True) -> VoxelGrid:
+    """The voxels of a scene, with no features where `features` is False; `shift` moves the grid, for training."""
     cell = (surfels.points + (0 if shift is None else shift)).div(VOXEL).floor().long()
     cells, owner, count = unique_cells(cell)
     order = owner.argsort(stable=True)
+    points = _means(surfels.points, order, count)
+    if not features:
+        return VoxelGrid(cells, points, points[:, :0], owner)
     axes = surfels.flatness[:, None, None] * _outer(surfels.normals)
-    points, lab, toward, axes = (_means(v, order, count) for v in (surfels.points, surfels.lab, surfels.toward, axes))
+    lab, toward, axes = (_means(v, order, count) for v in (surfels.lab, surfels.toward, axes))
     normals = _normals(points, axes, toward)
     within = (points + (0 if shift is None else shift)) / VOXEL - cells - 0.5
     z = points[:, 2:]
@@ -124,11 +127,17 @@ def neighbour_table(cells: Int[Tensor, "v 3"]) -> Int[Tensor, "v 27"]:
 
     Column k is offset (k // 9, k // 3 % 3, k % 3) - 1, so that column 26 - k is the opposite one.
     """
-    keys, order = _keys(cells).sort()
-    offsets = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3).to(cells)
-    wanted = _keys(cells[:, None] + offsets)
-    at = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
-    return torch.where(keys[at] == wanted, order[at], len(cells))
+    count, own = len(cells), _keys(cells)
+    keys, order = own.sort()
+    offsets = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)[:13].to(cells)
+    wanted = own[:, None] + (_keys(offsets) - _keys(torch.zeros_like(offsets[0])))
+    at = torch.searchsorted(keys, wanted).clamp_max(count - 1)
+    table = torch.full((count, 27), count, device=cells.device)
+    table[:, 13] = torch.arange(count, device=cells.device)
+    i, k = torch.nonzero(keys[at] == wanted, as_tuple=True)
+    j = order[at[i, k]]
+    table[i, k], table[j, 26 - k] = j, i
+    return table
 
 
 def _keys(cells: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:

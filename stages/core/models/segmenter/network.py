@@ -9,6 +9,7 @@ Offsets as in PointGroup (Jiang et al. 2020); convolutions touch occupied voxels
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -20,9 +21,7 @@ CLASSES = ("surface", "object", "clutter")
 OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
 PAIR_FEATURES = 24  # of the embedding
 CANDIDATE_FEATURES = 33  # of a candidate object, see candidates.py
-BLOCK_VOXELS = (
-    512  # that a convolution gathers at a time on a CPU, so that they stay in the cache; 256 is as fast (Intel Xeon)
-)
+BLOCK_VOXELS = 4096  # of whose neighbours a convolution holds the products at a time on a CPU
 SCORES = ("feature_", "candidate_head.")  # how the names of the weights of the scores of candidates begin
 
 
@@ -33,6 +32,35 @@ class Level:
     neighbours: Int[Tensor, "v 27"]
     parent: Int[Tensor, "v"]  # voxel of the next coarser level
     children: Int[Tensor, "w 8"]  # of each voxel of the next coarser level; v where there is none
+
+    @cached_property
+    def blocks(self) -> list[NeighbourBlock]:
+        """The neighbours that exist, of BLOCK_VOXELS voxels at a time."""
+        return [NeighbourBlock.of(rows, len(self.neighbours)) for rows in self.neighbours.split(BLOCK_VOXELS)]
+
+
+@dataclass(frozen=True)
+class NeighbourBlock:
+    """The neighbours of b consecutive voxels, m in all: a third of the 27 of each, where voxels are of surfaces."""
+
+    sources: tuple[Int[Tensor, "_"], ...]  # the voxels at each of the 27 offsets
+    order: Int[Tensor, "m"]  # places in the list of all sources, one voxel's neighbours after the other's
+    starts: Int[Tensor, "b"]  # of each voxel in `order`
+
+    @classmethod
+    def of(cls, neighbours: Int[Tensor, "b 27"], count: int) -> NeighbourBlock:
+        """The neighbours below `count`."""
+        exists = neighbours < count
+        place = exists.mT.flatten().cumsum(0).view(27, -1).mT - 1
+        sources, number = neighbours.mT[exists.mT].split(exists.sum(0).tolist()), exists.sum(1)
+        return cls(sources, place[exists], number.cumsum(0) - number)
+
+    def products(self, x: Float[Tensor, "v c"], weight: Float[Tensor, "27 c d"]) -> Float[Tensor, "b d"]:
+        """For each voxel the sum of its neighbours' features times the weights of their offsets."""
+        each = x.new_empty(len(self.order), weight.shape[2])
+        for rows, matrix, out in zip(self.sources, weight, each.split([len(s) for s in self.sources]), strict=True):
+            torch.mm(x.index_select(0, rows), matrix, out=out)
+        return nn.functional.embedding_bag(self.order, each, self.starts, mode="sum")
 
 
 def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
@@ -48,18 +76,21 @@ def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
 class _SparseConvolution(torch.autograd.Function):
     """x[neighbours] @ weight for a symmetric table of neighbours; the gradient gathers as well, without a scatter.
 
+    On a GPU one product with zeros for what is absent is faster; on a CPU only neighbours that exist are multiplied.
+
     Within `torch.autocast` the products are in its precision; the result is in that of x.
     """
 
     @staticmethod
-    def forward(ctx, x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
-        device = x.device.type
+    def forward(ctx, x: Tensor, level: Level, weight: Tensor) -> Tensor:
+        device, neighbours = x.device.type, level.neighbours
         ctx.dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
         ctx.save_for_backward(x, neighbours, weight)
-        padded, matrix = _padded(x.to(ctx.dtype)), weight.flatten(0, 1).to(ctx.dtype)
+        narrow, weight = x.to(ctx.dtype), weight.to(ctx.dtype)
         with torch.autocast(device, enabled=False):
-            blocks = neighbours.split(BLOCK_VOXELS) if device == "cpu" else (neighbours,)
-            return torch.cat([_rows(padded, block) @ matrix for block in blocks]).to(x.dtype)
+            if device == "cpu":
+                return torch.cat([block.products(narrow, weight) for block in level.blocks]).to(x.dtype)
+            return (_gather(narrow, neighbours) @ weight.flatten(0, 1)).to(x.dtype)
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, Tensor]:
@@ -74,16 +105,8 @@ class _SparseConvolution(torch.autograd.Function):
 
 def _gather(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
     """The features of k voxels side by side, zeros where there is none."""
-    return _rows(_padded(x), table)
-
-
-def _padded(x: Float[Tensor, "v c"]) -> Float[Tensor, "v+1 c"]:
-    """The features and a row of zeros, for voxels that do not exist."""
-    return torch.nn.functional.pad(x, (0, 0, 0, 1))
-
-
-def _rows(x: Float[Tensor, "n c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
-    return x.index_select(0, table.flatten()).reshape(len(table), -1)
+    padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
+    return padded.index_select(0, table.flatten()).reshape(len(table), -1)
 
 
 def _pooled(x: Float[Tensor, "v c"], children: Int[Tensor, "w 8"]) -> Float[Tensor, "w c"]:
@@ -101,7 +124,7 @@ class Convolution(nn.Module):
         self.weight = nn.Parameter(scale * torch.randn(27, in_channels, out_channels))
 
     def forward(self, x: Float[Tensor, "v c"], level: Level) -> Float[Tensor, "v d"]:
-        return _SparseConvolution.apply(x, level.neighbours, self.weight)
+        return _SparseConvolution.apply(x, level, self.weight)
 
 
 class ResidualBlock(nn.Module):

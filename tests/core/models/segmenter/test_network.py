@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from stages.core.models.segmenter import network
 from stages.core.models.segmenter.network import Convolution, Segmenter, pyramid
 from stages.core.models.segmenter.voxels import FEATURES, neighbour_table
 
@@ -14,7 +15,9 @@ def some_cells(seed: int = 0) -> torch.Tensor:
     return cells[torch.randperm(len(cells), generator=generator)[: len(cells) // 2]]
 
 
-def test_a_convolution_is_that_of_a_dense_grid_with_zeros_elsewhere(device):
+@pytest.mark.parametrize("block", [17, 4096])
+def test_a_convolution_is_that_of_a_dense_grid_with_zeros_elsewhere(device, block, monkeypatch):
+    monkeypatch.setattr(network, "BLOCK_VOXELS", block)
     cells = some_cells().to(device)
     x = torch.randn(len(cells), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     x = x.to(device).requires_grad_()

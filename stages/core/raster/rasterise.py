@@ -170,12 +170,14 @@ def _splats(
 
 
 def _features(g: Gaussians, features: Tensor, view: _View):
-    """Composite four features at a time in the columns of colour and depth."""
+    """Composite four features at a time in the columns of colour and depth, on a CPU where they are not all zero."""
     splats, bins = _splats(g, view.packed(g), view.width, view.height)
     count = features.shape[1]
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))
     images = []
     for four in padded.split(4, dim=1):
-        rgb, fourth, _ = composite(torch.cat([splats[:, :6], four, splats[:, 10:]], 1), bins)
+        drawn = torch.cat([splats[:, :6], four, splats[:, 10:]], 1)
+        where = bins if drawn.is_cuda or drawn.requires_grad else bins.with_any(four.any(1))
+        rgb, fourth, _ = composite(drawn, where)
         images += [rgb, fourth[..., None]]
     return torch.cat(images, -1)[..., :count] if images else splats.new_zeros(view.height, view.width, 0)

@@ -230,6 +230,11 @@ def test_features_are_composited_like_colours(device, count):
         grey = colours[:, channel : channel + 1].detach().expand(-1, 3)
         shot = rasterise(replace(gaussians, sh=rgb_to_sh(grey)), cameras.viewmats, cameras.Ks, 48, 40)
         torch.testing.assert_close(image[..., channel].detach(), shot.rgb[..., 0], rtol=0, atol=1e-5)
+    with torch.no_grad():  # bins where four features are all zero are left out
+        few = colours * (torch.arange(200) < 5)[:, None].to(device)
+        shown = rasterise_features(gaussians, few, cameras.viewmats, cameras.Ks, 48, 40)
+    all_bins = rasterise_features(gaussians, few.requires_grad_(), cameras.viewmats, cameras.Ks, 48, 40)
+    assert torch.equal(shown, all_bins) and (shown > 0).any() and (shown == 0).any()
     # the derivative by a feature is the Gaussian's total weight
     (grad,) = torch.autograd.grad(image.sum(), colours)
     weights = sum(visibility(gaussians, V, K, 48, 40)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))

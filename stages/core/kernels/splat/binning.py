@@ -6,7 +6,7 @@ sorted: fewer keys than one for each pair of splat and bin.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -141,6 +141,15 @@ class Bins:
         total = (work + 1).cumsum(0).double()
         cuts = torch.searchsorted(total, total[-1] * torch.arange(1, count) / count)
         return sorted({0, *cuts.tolist(), len(work)})
+
+    def with_any(self, which: Tensor) -> Bins:
+        """The same without the members of bins that hold none of the splats `which` (n,). Not for gradients."""
+        bins, counts = len(self.starts) - 1, self.starts.diff()
+        bin_of = torch.repeat_interleave(torch.arange(bins), counts)
+        kept = torch.zeros(bins, dtype=torch.bool)
+        kept[bin_of[which[self.members]]] = True
+        starts = torch.nn.functional.pad((counts * kept).cumsum(0, dtype=torch.int32), (1, 0))
+        return replace(self, members=self.members[kept[bin_of]], starts=starts)
 
 
 def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN_SIZE) -> Bins:

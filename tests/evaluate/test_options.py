@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from stages.core.errors import InputError
 from stages.evaluate.options import MAX_FILMS_PER_QUESTION, EvaluateOptions
+from tests.limits import check_limits
 
 
 @pytest.mark.parametrize(("name", "accepted", "refused"), [
@@ -14,11 +14,7 @@ from stages.evaluate.options import MAX_FILMS_PER_QUESTION, EvaluateOptions
     ("report", (Path("a.html"), Path("a.HTM"), None), (Path("a.pdf"), Path("html"))), ("photos", (None,), (Path("p"),)),
 ])  # fmt: skip
 def test_limits_of_options(name, accepted, refused):
-    for value in accepted:
-        assert getattr(EvaluateOptions(**{name: value}), name) == value
-    for value in refused:
-        with pytest.raises(InputError, match="^--" + name.replace("_", "-")):
-            EvaluateOptions(**{name: value})
+    check_limits(EvaluateOptions, name, accepted, refused)
 
 
 def test_photos_are_for_the_report_and_objects_are_named():

@@ -1,8 +1,6 @@
 """Errors of the command line: one line on stderr, exit status 2, and no incomplete file."""
 
-import resource
 import signal
-from contextlib import contextmanager
 from importlib import import_module
 
 import numpy as np
@@ -17,6 +15,7 @@ from stages.core.scene.scene_ply import write_scene
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 from tests.conftest import two_balls_scene
+from tests.limits import file_size_limit
 from tests.pipeline.test_commands import call
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -110,17 +109,6 @@ def test_a_missing_folder_is_reported_before_the_work(input_files, stage, name, 
     monkeypatch.setattr(f"stages.{stage}.stage.{name}", value)
     with pytest.raises(InputError, match="no folder"):
         import_module(f"stages.{stage}.stage").run(input_files / "good.ply", input_files / "nowhere/o.ply")
-
-
-@contextmanager
-def file_size_limit(size: int):
-    """No file may exceed `size` bytes, which a program notices like a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 FULL = [

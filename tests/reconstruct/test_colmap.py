@@ -1,6 +1,5 @@
 """COLMAP's long steps run in a process of their own: what ends or fails there is one error here."""
 
-import resource
 import threading
 
 import pytest
@@ -9,6 +8,7 @@ from stages.core.errors import InputError
 from stages.reconstruct import colmap
 from stages.reconstruct.colmap import colmap_process, run_colmap
 from stages.reconstruct.features import writing_database
+from tests.limits import file_size_limit
 
 pytest.importorskip("pycolmap")
 
@@ -56,14 +56,9 @@ def test_what_colmap_refuses_is_an_error_with_its_words(tmp_path):
 
 def test_a_full_disk_is_one_error(tmp_path):
     """SQLite or COLMAP may raise or abort: each is an InputError."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     (tmp_path / "a.pgm").write_bytes(b"P5 64 64 255\n" + bytes(range(256)) * 16)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    try:
-        with pytest.raises(InputError, match="COLMAP"), writing_database(tmp_path):
-            run_colmap("extract", tmp_path, names=["a.pgm"], threads=1)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with file_size_limit(4096), pytest.raises(InputError, match="COLMAP"), writing_database(tmp_path):
+        run_colmap("extract", tmp_path, names=["a.pgm"], threads=1)
 
 
 def test_the_process_ends_when_the_one_that_started_it_does(tmp_path):

@@ -6,6 +6,7 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.segment.options import SegmentOptions
+from tests.limits import check_limits
 
 SOME = Path("some")
 
@@ -16,11 +17,7 @@ SOME = Path("some")
     ("names", ("", "1=duck", "65535=a, 007=b b,"), ("duck", "0=a", "1=", "1 2=a", "x=a", "123456=a")),
 ])  # fmt: skip
 def test_limits_of_options(name, accepted, refused):
-    for value in accepted:
-        assert getattr(SegmentOptions(**{name: value}), name) == value
-    for value in refused:
-        with pytest.raises(InputError, match="^--" + name.replace("_", "-")):
-            SegmentOptions(**{name: value})
+    check_limits(SegmentOptions, name, accepted, refused)
 
 
 def test_names_by_number():

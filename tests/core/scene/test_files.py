@@ -1,12 +1,10 @@
 """Files that are replaced when complete."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 
 import pytest
 import torch
@@ -17,6 +15,7 @@ from stages.core.scene import error_deferring_file, files
 from stages.core.scene.error_deferring_file import ErrorDeferringFile
 from stages.core.scene.files import must_exist, replacing, save_tensors, seconds_since
 from stages.core.scene.schema import read_json
+from tests.limits import file_size_limit
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path):
@@ -84,27 +83,16 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path):
     assert not pipe.is_file() and os.listdir(tmp_path) == ["a.json"]
 
 
-@contextmanager
-def disk_for(size):
-    """Files can be no longer than `size` bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 @pytest.mark.parametrize("size", [0, 1, 100, 5000, 20000])
 def test_tensors_that_do_not_fit_on_the_disk_are_refused(tmp_path, size):
-    with pytest.raises(InputError, match=r"a\.pt: cannot be written \(File too large\)"), disk_for(size):
+    with pytest.raises(InputError, match=r"a\.pt: cannot be written \(File too large\)"), file_size_limit(size):
         save_tensors(tmp_path / "a.pt", {"a": torch.zeros(1000), "b": [torch.zeros(5000)]})
     assert not os.listdir(tmp_path)
 
 
 def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported(tmp_path):
     with ErrorDeferringFile(tmp_path / "a", "w+b") as file:
-        with disk_for(10):
+        with file_size_limit(10):
             file.write(b"0123456")
             file.write(b"789abcdef")
             file.seek(20)

@@ -1,0 +1,29 @@
+"""Limits: of the sizes of files, as on a full disk, and of the values of options."""
+
+import resource
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from stages.core.errors import InputError
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """No file may exceed `size` bytes, which a program notices like a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def check_limits(options: type, name: str, accepted: Iterable, refused: Iterable) -> None:
+    """An option takes the values `accepted`, and its name is in the errors of those `refused`."""
+    for value in accepted:
+        assert getattr(options(**{name: value}), name) == value
+    for value in refused:
+        with pytest.raises(InputError, match="^--" + name.replace("_", "-")):
+            options(**{name: value})

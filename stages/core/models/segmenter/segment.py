@@ -114,7 +114,8 @@ def object_ids(
     if len(surfels) < 20:
         return ids
     scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
-    labels = best_objects([s.best(options) for s in scored])
+    found = [s.best(options) for s in scored]
+    labels = best_objects([f if s.scale >= 1 else confirmed(f, scored[0]) for s, f in zip(scored, found, strict=True)])
     labels = torch.where(labels <= options.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
     ids = refine_outlines(scene, ids, device=model.input_projection.weight.device)
@@ -155,6 +156,21 @@ class ScoredCandidates:
         own = torch.full((int(self.owner.max()) + 2,), -1)  # the last is for surfels without a voxel
         own[self.candidates.voxels] = torch.from_numpy(self.candidates.tree.labels(nodes))[self.candidates.leaf]
         return own[self.owner]
+
+    def expected_ious(self, objects: Segmentation) -> Float[Tensor, "k"]:
+        """The IoU that each of some objects is expected to have by the candidates of this scale.
+
+        That is the IoU with a candidate times the one that this is expected to have, where the product is largest.
+        """
+        count, inside = int(self.owner.max()) + 1, self.owner >= 0
+        both = inside & (objects.labels >= 0)
+        shared = torch.zeros(count, len(objects.gains)).double()
+        shared.index_put_((self.owner[both], objects.labels[both]), torch.ones(()).double(), accumulate=True)
+        common = torch.from_numpy(self.candidates.sums(shared))
+        surfels = self.candidates.sums(torch.bincount(self.owner[inside], minlength=count)[:, None])
+        iou = common / (torch.from_numpy(surfels) + objects.sizes - common)
+        expected = torch.cat([iou * self.ious[:, None], torch.zeros(1, len(objects.gains))])
+        return expected.amax(0).float()
 
     def best(self, options: SegmenterOptions) -> Segmentation:
         """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by surfels.
@@ -212,6 +228,17 @@ def averaged_prediction(
 
     parts = [predict(k) for k in range(copies)] if device.type == "cuda" else parallel_map(predict, range(copies))
     return levels, Prediction(*(torch.stack([getattr(p, f.name) for p in parts]).mean(0) for f in fields(Prediction)))
+
+
+def confirmed(objects: Segmentation, scored: ScoredCandidates) -> Segmentation:
+    """Those objects of a reduced scene of which the mean of the expected IoU and that at the scale of `scored` is at
+    least MIN_LONG_IOU: reduced, things that are near each other look like one.
+    """
+    iou = (objects.gains / objects.sizes + OBJECT_COST + scored.expected_ious(objects)) / 2
+    kept = torch.nonzero(iou >= MIN_LONG_IOU)[:, 0]
+    row = torch.full((len(iou) + 1,), -1)  # the last is for surfels of no object
+    row[kept] = torch.arange(len(kept))
+    return Segmentation(row[objects.labels], objects.gains[kept], objects.sizes[kept])
 
 
 def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[ScoredCandidates]) -> Int[Tensor, "n"]:

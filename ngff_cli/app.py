@@ -108,6 +108,10 @@ def simulate(
     integrator: Annotated[
         str, Option(help="learned engine: step (the model's own) or an ODE solver: euler | rk4 | dopri5")
     ] = SimulateOptions.integrator,
+    contact: Annotated[
+        str,
+        Option(help="engine ngff: learned, or solved by the materials' friction and loss factor (slower)"),
+    ] = SimulateOptions.contact,
     live: Annotated[
         bool,
         Option(
@@ -128,8 +132,8 @@ def simulate(
         steps=steps, dt=dt, engine=engine, gravity=gravity, quality=quality, material=tuple(material or ()),
         materials=materials, force=tuple(force or ()), forces=forces, pin=tuple(pin or ()),
         velocity=tuple(velocity or ()), lift=tuple(lift or ()), floor=floor, friction=friction, box=box,
-        keypoints=keypoints, weights=weights, integrator=integrator, live=live, browser=browser, port=port, seed=seed,
-        device=device,
+        keypoints=keypoints, weights=weights, integrator=integrator, contact=contact, live=live, browser=browser,
+        port=port, seed=seed, device=device,
     )  # fmt: skip
     load("stages.simulate.stage:run")(scene, out, options)
 

@@ -317,6 +317,7 @@ def bench_physics(
     quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = "draft",
     keypoints: Keypoints = 256,
     weights: Annotated[Path | None, Option(help="weights of the learned engine; default: those in the package")] = None,
+    contact: Annotated[str, Option(help="contacts of the engine ngff: learned | solved")] = "learned",
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -325,8 +326,9 @@ def bench_physics(
 
     chosen = {"engines": tuple(engine)} if engine else {}
     options = PhysicsBenchOptions(
-        only=tuple(only), quality=quality, keypoints=keypoints, weights=weights, device=device, **chosen
-    )
+        only=tuple(only), quality=quality, keypoints=keypoints, weights=weights, contact=contact, device=device,
+        **chosen,
+    )  # fmt: skip
     print_results(lambda path: run(path, options), out, as_json)
 
 

@@ -27,11 +27,11 @@ def with_engine(
     object by more than MAX_RIGID_SAG, nor the speed that the prompts give it by more than MAX_RIGID_IMPACT. Of the two
     engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
     learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
-    Options of learned engines (weights, an integrator) select it.
+    Options of learned engines (weights, an integrator, its contacts) select it.
     """
     if options.engine != AUTO:
         return options
-    if options.weights is not None or options.integrator != "step":
+    if options.weights is not None or options.integrator != "step" or options.contact != "learned":
         return replace(options, engine="ngff")
     materials = choose_materials(scene.objects, options.material, options.materials)
     uneven = [o for o in scene.objects if materials[o.id].several]

@@ -16,7 +16,9 @@ from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field.force_field import ForceField
 from stages.core.models.field.solidity import MIN_STIFFNESS, box_sides, solidity
+from stages.core.models.field.solved_field import SolvedForceField
 from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
@@ -27,6 +29,7 @@ from stages.core.scene.field_start import FieldStart, FieldUnits
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
+from stages.simulate.field_surfaces import body_surfaces
 from stages.simulate.model_units import TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
 from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, set_up_scene
@@ -82,6 +85,12 @@ def rollout(
     objects = FieldObjects(scene, per_object, solids, setup, units, prompts.velocity)
     initial = _initial_conditions(objects, options)
     _warn_extrapolation(initial, model)
+    if options.contact == "solved":
+        if not isinstance(model, ForceField):
+            raise InputError(f"--contact solved: not for weights of {card['model']}, only for those of the engine ngff")
+        floors = _floor_heights(per_object, setup)
+        surfaces = body_surfaces(scene, initial, units, setup.lift, floors, options.seed)
+        model = SolvedForceField(model, surfaces.to(device))
     in_model_units = ForcePrompts(units.forces(prompts.forces, setup.lift, ids), prompts.pinned)
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))

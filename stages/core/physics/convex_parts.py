@@ -64,17 +64,27 @@ def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[C
     What lies below the height `bottom` is cut off. Raises InputError for an object without
     any usable Gaussian.
     """
-    ids = [o.id for o in scene.objects]
-    solids = parallel_map(lambda id: _solid(scene, id, seed, bottom), ids)
+    solids, out = _solids(scene, seed, bottom), []
     # on one thread: small arrays, during which Python holds its lock
-    out = []
+    for row, (solid, ball) in enumerate(zip(solids, balls(scene, seed, bottom), strict=True)):
+        out.append(_parts(solid, _around(solids, row, solid.h), seed) if ball is None else _ball_parts(ball))
+    return out
+
+
+@cached_in_scene
+def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | None]:
+    """The balls among the objects, in the order of scene.objects; arguments and errors as those of `convex_parts`."""
+    solids, out = _solids(scene, seed, bottom), []
     for row, solid in enumerate(solids):
         ball = fitted_ball(solid.surface, bottom, all_seen=scene.cameras is None)
-        if ball is not None and ball.clear_of(_around(solids, row, DENT * ball.radius)):
-            out.append(_ball_parts(ball))
-        else:
-            out.append(_parts(solid, _around(solids, row, solid.h), seed))
+        clear = ball is not None and ball.clear_of(_around(solids, row, DENT * ball.radius))
+        out.append(ball if clear else None)
     return out
+
+
+@cached_in_scene
+def _solids(scene: Scene, seed: int, bottom: float) -> list[Solid]:
+    return parallel_map(lambda id: _solid(scene, id, seed, bottom), [o.id for o in scene.objects])
 
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:

@@ -36,6 +36,7 @@ class PhysicsBenchOptions:
     quality: str = "draft"  # of MPM
     keypoints: int = 256
     weights: Path | None = None  # of the learned engine
+    contact: str = "learned"  # of the engine ngff
     device: str = "auto"
 
     def __post_init__(self):
@@ -79,10 +80,11 @@ def trajectory(run: Run, engine: str, options: PhysicsBenchOptions) -> Trajector
         scene, materials, out = (Path(folder) / name for name in ("scene.ply", "materials.json", "traj.h5"))
         write_scene(scene, run.scene())
         materials.write_text(json.dumps({str(i + 1): body.material() for i, body in enumerate(run.bodies)}))
+        contact = options.contact if engine == "ngff" else "learned"
         weights = options.weights if engine != AUTO and ENGINES[engine].weights else None
         simulate(scene, out, SimulateOptions(
             engine=engine, materials=materials, quality=options.quality, keypoints=options.keypoints, weights=weights,
-            device=options.device, **run.options,
+            contact=contact, device=options.device, **run.options,
         ))  # fmt: skip
         return read_trajectory(out)
 
@@ -104,9 +106,11 @@ def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iter
     Also writes the table beside it as Markdown. Raises InputError where `out` has rows of another quality.
     """
     table, device = experiments(), pick_device(options.device)
-    facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}, "quality": options.quality}
-    if facts.get("quality") != options.quality:
-        raise InputError(f"{out}: has rows measured at --quality {facts.get('quality')}; name another file (-o)")
+    facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}, "quality": options.quality,
+                                    "contact": options.contact}  # fmt: skip
+    for name, default in (("quality", None), ("contact", "learned")):
+        if (before := facts.get(name, default)) != getattr(options, name):
+            raise InputError(f"{out}: has rows measured at --{name} {before}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}
     for experiment in options.chosen():
         row = facts["rows"].setdefault(experiment.name, {})

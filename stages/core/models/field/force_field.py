@@ -155,7 +155,7 @@ class ForceField(Dynamics):
         Friction and the penetration limit are step rules, not forces; here they act as if spread over one FRAME.
         """
         movable = ~external.pinned[..., None]
-        state = _without_pinned(state, movable)
+        state = without_pinned(state, movable)
         bodies = self._kinematics(scene, state)
         rates = self._accelerations(scene, state, bodies, external, (t, 0.0))
         same = state.velocity, bodies.spin
@@ -184,7 +184,7 @@ class ForceField(Dynamics):
         """
         if self._use_fused_step(scene):
             return fused_step.step(self, scene, state, t, dt, external)
-        if _has_small_operations(scene.shape.arm):
+        if has_small_operations(scene.shape.arm):
             with small_operations():
                 return self._split_step(scene, state, t, dt, external)
         return self._split_step(scene, state, t, dt, external)
@@ -194,7 +194,7 @@ class ForceField(Dynamics):
     ) -> BodyState:
         """`step` by PyTorch operations."""
         movable = ~external.pinned[..., None]
-        half = self._drifted(scene, _without_pinned(state, movable), dt / 2)
+        half = self._drifted(scene, without_pinned(state, movable), dt / 2)
         bodies = self._kinematics(scene, half)
         rates = self._accelerations(scene, half, bodies, external, (t, dt))
         momentum = half.momentum + dt * rates.torque
@@ -211,7 +211,7 @@ class ForceField(Dynamics):
         du = (half.du + dt * (rates.internal - k * half.u)) / (1 + dt * c + dt * dt / 2 * k)
         du = bounded(scene.shape, du / MAX_SPEED) * MAX_SPEED
         updated = half._replace(velocity=velocity, momentum=momentum, du=du)
-        return self._drifted(scene, _without_pinned(updated, movable), dt / 2)
+        return self._drifted(scene, without_pinned(updated, movable), dt / 2)
 
     def _use_fused_step(self, scene: FieldScene) -> bool:
         """Whether `fused_step` can replace `step`: on CUDA, without gradients, for the sizes its kernels support."""
@@ -308,13 +308,13 @@ class ForceField(Dynamics):
         return x[:, shape.others, shape.back].sum(2)
 
 
-def _has_small_operations(arm: Float[Tensor, "b o n 3"]) -> bool:
+def has_small_operations(arm: Float[Tensor, "b o n 3"]) -> bool:
     """Whether most operations of a step are too small for several CPU threads; with gradients, threads are kept."""
     points = arm.shape[0] * arm.shape[1] * arm.shape[2]
     return not arm.is_cuda and not torch.is_grad_enabled() and points <= MAX_SINGLE_THREAD_POINTS
 
 
-def _without_pinned(state: BodyState, movable: Bool[Tensor, "b o 1"]) -> BodyState:
+def without_pinned(state: BodyState, movable: Bool[Tensor, "b o 1"]) -> BodyState:
     """The state with zero velocities of pinned objects."""
     return state._replace(
         velocity=state.velocity * movable, momentum=state.momentum * movable, du=state.du * movable[..., None]

@@ -1,0 +1,77 @@
+"""Surfaces of a scene's objects for the contacts of the learned field, in model units and the frames of its bodies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
+from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
+from stages.core.physics.convex_parts import balls
+from stages.core.physics.keypoints import farthest_points
+from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.scene.scene import Scene
+from stages.simulate.model_units import ModelUnits
+
+SAMPLES = 512  # keypoints of a body that are looked up in others: a twentieth of its size apart
+NEAR = 4  # voxels from the surface up to which the nearest keypoint is found
+
+
+def body_surfaces(
+    scene: Scene, initial: InitialConditions, units: ModelUnits, lift: Float[Tensor, "o 3"],
+    floors: Float[Tensor, "o"], seed: int,
+) -> BodySurfaces:  # fmt: skip
+    """The surfaces of all objects, each cut off at its floor [scene units], and their overlaps at the start."""
+    com = centre_of_mass(initial, initial.points)
+    grids = []
+    arms = torch.where(initial.valid[..., None], initial.points - com[:, :, None], 0.0)[0]
+    found = balls(scene, seed, float(floors.min()))
+    for row, o in enumerate(scene.objects):
+        own = arms[row, initial.valid[0, row]]
+        surface = solid_surface(scene, o.id, seed).fitted
+        _, first = surface.depth_grid()
+        low = units.to_model(torch.from_numpy(first).float() + lift[row]) - com[0, row]
+        grid = _grid(surface, float(floors[row]), own, low, units.length, seed)
+        if (ball := found[row]) is not None:
+            centre = units.to_model(torch.from_numpy(ball.centre).float() + lift[row]) - com[0, row]
+            grid = replace(grid, ball=(centre, units.length * ball.radius))
+        grids.append(grid)
+    surfaces = BodySurfaces.of(grids, arms)
+    return replace(surfaces, overlap=_overlaps(surfaces, initial.points[0], com[0]))
+
+
+def _grid(
+    surface: SolidSurface, floor: float, arm: Float[Tensor, "n 3"], low: Float[Tensor, "3"], length: float, seed: int
+) -> BodyGrid:
+    depth, first = surface.depth_grid()
+    height = first[2] + surface.h * np.arange(depth.shape[2]) - floor
+    depth = np.minimum(depth, height)
+    nodes = np.argwhere(np.abs(depth) < NEAR * surface.h)
+    keypoint = np.zeros(depth.shape, np.int64)
+    places = low.numpy() + length * surface.h * nodes
+    keypoint[tuple(nodes.T)] = cKDTree(arm.numpy()).query(places, workers=-1)[1]
+    smooth = ndimage.gaussian_filter(depth, 1.0)
+    on_grid = (torch.from_numpy(length * x).float() for x in (depth, smooth))
+    return BodyGrid(*on_grid, torch.from_numpy(keypoint), low, length * surface.h, farthest_points(arm, SAMPLES, seed))
+
+
+def _overlaps(
+    surfaces: BodySurfaces, points: Float[Tensor, "o n 3"], com: Float[Tensor, "o 3"]
+) -> Float[Tensor, "o o"]:
+    """How deep the samples of each body are in each other one [m]."""
+    o, k = surfaces.samples.shape
+    out = torch.zeros(o, o)
+    rows: Int[Tensor, "o k"] = surfaces.samples.clamp_min(0)
+    at = points[torch.arange(o)[:, None], rows]
+    for b in range(o):
+        depth, _ = surfaces.look_up(torch.full((o * k,), b), (at - com[b]).flatten(0, 1))
+        depth = torch.where(surfaces.samples >= 0, depth.view(o, k), 0.0)
+        out[:, b] = depth.amax(1).clamp_min(0)
+    out.fill_diagonal_(0.0)
+    return out

@@ -1,0 +1,36 @@
+"""`--engine ngff --contact solved` against textbook physics, through the stage."""
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.core.physics.keypoints import choose_keypoints
+from stages.lab.bench.physics import PhysicsBenchOptions, measure
+from stages.lab.bench.physics_experiments import experiments
+from stages.simulate.engine_choice import with_engine
+from stages.simulate.options import SimulateOptions
+from tests.conftest import two_balls_scene
+
+SOLVED = PhysicsBenchOptions(contact="solved")
+
+
+@pytest.mark.parametrize("name", ["rebound/box loss=0.15", "bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3",
+                                  "roll/25deg"])  # fmt: skip
+def test_agrees_with_theory_where_learned_contact_does_not(name):
+    experiment = experiments()[name]
+    assert experiment.passes("ngff", measure(experiment, "ngff", SOLVED)["value"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["slide/friction=0.1", "slide/soft friction=0.3", "slope/40deg friction=0.3",
+                                  "tower/3 for 2s", "boxes/0.06m 540kg/m3 1e+07Pa"])  # fmt: skip
+def test_agrees_with_theory(name):
+    test_agrees_with_theory_where_learned_contact_does_not(name)
+
+
+def test_is_an_option_of_the_learned_field():
+    with pytest.raises(InputError, match="--contact hard: choose from learned, solved"):
+        SimulateOptions(contact="hard")
+    with pytest.raises(InputError, match="--contact solved: only for --engine ngff, not for rigid"):
+        SimulateOptions(engine="rigid", contact="solved")
+    scene = two_balls_scene()
+    assert with_engine(SimulateOptions(contact="solved"), scene, choose_keypoints(scene, 32)).engine == "ngff"

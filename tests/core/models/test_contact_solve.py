@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from stages.core.models.field.contact_solve import Bodies, Contacts, solve
+from stages.core.models.field.contact_solve import BodyInertia, Contacts, solve
 
 DT, G, MASS = 0.005, 5.0, 2.0
 
@@ -22,7 +22,9 @@ def box_on_floor(speed, friction, tilt=0.0):
     start[0, 0] = speed
     free = start.clone()
     free[0, :3] += DT * gravity
-    bodies = Bodies(torch.tensor([MASS]).double(), inertia[None], inertia.inverse()[None], free, torch.tensor([False]))
+    bodies = BodyInertia(
+        torch.tensor([MASS]).double(), inertia[None], inertia.inverse()[None], free, torch.tensor([False])
+    )
     up = torch.tensor([0.0, 0.0, 1.0]).double().expand(49, 3)
     contacts = Contacts(zero, zero, torch.ones(49, dtype=torch.bool), up, arm, arm, torch.zeros(49).double(),
                         torch.full((49,), friction).double())  # fmt: skip
@@ -64,7 +66,7 @@ def two_balls(pinned):
     one = torch.ones(1).double()
     contacts = Contacts(torch.tensor([0]), torch.tensor([1]), torch.tensor([False]), n, -radius * n, radius * n,
                         0.6 * one, 0.05 * one)  # fmt: skip
-    bodies = Bodies(mass, inertia, inertia.inverse(), velocity, torch.tensor([False, pinned]))
+    bodies = BodyInertia(mass, inertia, inertia.inverse(), velocity, torch.tensor([False, pinned]))
     return bodies, contacts, *solve(bodies, contacts, velocity)
 
 

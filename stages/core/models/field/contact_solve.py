@@ -41,7 +41,7 @@ class Contacts(NamedTuple):
     friction: Float[Tensor, "r"]
 
 
-class Bodies(NamedTuple):
+class BodyInertia(NamedTuple):
     """Inertia of the bodies in world axes, and their velocities without contact."""
 
     mass: Float[Tensor, "o"]  # [kg]
@@ -52,7 +52,7 @@ class Bodies(NamedTuple):
 
 
 def solve(
-    bodies: Bodies, contacts: Contacts, start: Float[Tensor, "o 6"]
+    bodies: BodyInertia, contacts: Contacts, start: Float[Tensor, "o 6"]
 ) -> tuple[Float[Tensor, "o 6"], Float[Tensor, "r 3"]]:
     """Velocities of the bodies after the step, and the impulses [N s] on the bodies a; double precision.
 
@@ -78,7 +78,7 @@ def solve(
 class _System:
     """The function to be minimised, for given contacts."""
 
-    def __init__(self, bodies: Bodies, contacts: Contacts):
+    def __init__(self, bodies: BodyInertia, contacts: Contacts):
         self.contacts, self.free = contacts, torch.where(bodies.pinned[:, None], 0.0, bodies.velocity)
         heavy = 1 + (PINNED_MASS * bodies.mass.max() / bodies.mass - 1) * bodies.pinned
         o, eye = len(bodies.mass), torch.eye(3).to(bodies.mass)

@@ -22,7 +22,7 @@ from stages.core.models.dynamics import FRAME
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.body_surfaces import BodySurfaces
 from stages.core.models.field.contact_points import BodyKinematics
-from stages.core.models.field.contact_solve import Bodies, Contacts, solve
+from stages.core.models.field.contact_solve import BodyInertia, Contacts, solve
 from stages.core.models.field.deformation import DeformationInputs, bounded
 from stages.core.models.field.equivariant import matvec
 from stages.core.models.field.force_field import ForceField, has_small_operations, without_pinned
@@ -40,7 +40,7 @@ CLOSEST_POINT_STEPS = 3  # to the point of a ball that is nearest to a surface
 SUBSTEPS = 4  # of the rigid motion in a step: in one a body that spins fast must not turn by more than its contacts
 
 
-class _Candidates(NamedTuple):
+class _NearPoints(NamedTuple):
     """Points of bodies a near bodies b, or near a plane."""
 
     a: Int[Tensor, "r"]
@@ -147,9 +147,9 @@ class SolvedForceField(ForceField):
         target = torch.where(rebounds, target.maximum(rebound), target)
         friction = w.friction[0, found.a].maximum(w.friction[0, found.b])
         inertia = w.mass[0, :, None, None] * (bodies.R @ w.body_inertia @ bodies.R.mT)[0]
-        system = Bodies(w.mass[0], inertia, bodies.inverse[0] / w.mass[0, :, None, None], free[0], pinned[0])
+        system = BodyInertia(w.mass[0], inertia, bodies.inverse[0] / w.mass[0, :, None, None], free[0], pinned[0])
         contacts = Contacts(found.a, found.b, fixed, found.normal, arm_a, arm_b, target, friction)
-        v, impulse = solve(Bodies(*map(_double, system)), Contacts(*map(_double, contacts)), before.double())
+        v, impulse = solve(BodyInertia(*map(_double, system)), Contacts(*map(_double, contacts)), before.double())
         per_mass = (impulse / dt).to(free)
         for body, keypoint, F in ((found.a, found.keypoint, per_mass),
                                   (found.b, found.other, torch.where(fixed[:, None], 0.0, -per_mass))):  # fmt: skip
@@ -159,7 +159,7 @@ class SolvedForceField(ForceField):
 
     def _candidates(
         self, scene: FieldScene, bodies: BodyKinematics, pinned: Bool[Tensor, "o"], dt: float
-    ) -> _Candidates:  # fmt: skip
+    ) -> _NearPoints:  # fmt: skip
         """Samples of each body near another one, near the floor or near a wall, at present."""
         s, w = self.surfaces, scene.shape.initial
         motion = torch.cat([bodies.velocity, bodies.spin], -1)[0]
@@ -192,13 +192,13 @@ class SolvedForceField(ForceField):
             gap = -depth + s.overlap[a, b]
             facing = facing - torch.where(s.flat[a, q], MIN_FACING_OF_FACE, MIN_FACING)
             keep = ((gap < reach[a] + reach[b]) & (facing > 0)).nonzero()[:, 0]
-            parts.append(_Candidates(*(y[keep] for y in (a, b, row[a, q], other, gap, normal, at[a, q]))))
-        return _Candidates(*(torch.cat(each) for each in zip(*parts, strict=True)))
+            parts.append(_NearPoints(*(y[keep] for y in (a, b, row[a, q], other, gap, normal, at[a, q]))))
+        return _NearPoints(*(torch.cat(each) for each in zip(*parts, strict=True)))
 
     def _of_balls(
         self, bodies: BodyKinematics, reach: Float[Tensor, "o"], a: Int[Tensor, "p"],
         b: Int[Tensor, "p"],
-    ) -> _Candidates:  # fmt: skip
+    ) -> _NearPoints:  # fmt: skip
         """The point of each ball a that is nearest to a body b."""
         s, R = self.surfaces, bodies.R[0]
         centre = bodies.com[0, a] + matvec(R[a], s.centre[a])
@@ -215,12 +215,12 @@ class SolvedForceField(ForceField):
         own, other = (s.nearest_keypoint(i, matvec(R[i].mT, at - bodies.com[0, i])) for i in (a, b))
         gap = gap + s.overlap[a, b]
         keep = (gap < reach[a] + reach[b]).nonzero()[:, 0]
-        return _Candidates(*(y[keep] for y in (a, b, own, other, gap, normal, at)))
+        return _NearPoints(*(y[keep] for y in (a, b, own, other, gap, normal, at)))
 
     def _at_planes(
         self, scene: FieldScene, bodies: BodyKinematics, at: Float[Tensor, "o k 3"], row: Int[Tensor, "o k"],
         reach: Float[Tensor, "o"], pinned: Bool[Tensor, "o"],
-    ) -> _Candidates:  # fmt: skip
+    ) -> _NearPoints:  # fmt: skip
         """Samples, and lowest points of balls, near floor, walls and ceiling."""
         s = self.surfaces
         eye = torch.eye(3, dtype=at.dtype, device=at.device)
@@ -237,7 +237,7 @@ class SolvedForceField(ForceField):
         c, end = ((of_ball < reach[:, None]) & (round_ & ~pinned)[:, None]).nonzero().T
         touching = s.nearest_keypoint(c, matvec(bodies.R[0, c].mT, ends[c, end] - bodies.com[0, c]))
         body, keypoint = torch.cat([a, c]), torch.cat([row[a, q], touching])
-        return _Candidates(
+        return _NearPoints(
             body, body, keypoint, keypoint, torch.cat([gap[a, q, side], of_ball[c, end]]),
             inward[torch.cat([side, end])], torch.cat([at[a, q], ends[c, end]]),
         )  # fmt: skip

@@ -20,8 +20,10 @@ def test_agrees_with_theory_where_learned_contact_does_not(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["slide/friction=0.1", "slide/soft friction=0.3", "slope/40deg friction=0.3",
-                                  "tower/3 for 2s", "roll/25deg", "rebound/box loss=0.15", "boxes/0.06m 540kg/m3 1e+07Pa"])  # fmt: skip
+@pytest.mark.parametrize("name", [
+    "slide/friction=0.1", "slide/soft friction=0.3", "slope/40deg friction=0.3", "tower/3 for 2s", "roll/25deg",
+    "rebound/box loss=0.15", "boxes/0.06m 540kg/m3 1e+07Pa",
+])  # fmt: skip
 def test_agrees_with_theory(name):
     test_agrees_with_theory_where_learned_contact_does_not(name)
 

@@ -43,6 +43,7 @@ class PhysicsBenchOptions:
         unknown = [name for name in self.engines if name not in (AUTO, *ENGINES)]
         if unknown:
             raise InputError(f"--engine {unknown[0]}: choose from {', '.join((AUTO, *ENGINES))}")
+        SimulateOptions(contact=self.contact)  # raises for another
 
     def chosen(self) -> list[Experiment]:
         """The experiments whose name fits one of the patterns. Raises InputError where a pattern fits none."""

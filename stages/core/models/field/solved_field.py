@@ -33,8 +33,8 @@ MARGIN = 0.05  # gap up to which points count, in addition to the way of a step 
 RECOVERY = 0.2  # share of an overlap that is removed in a step (Baumgarte 1972)
 MAX_RECOVERY_SPEED = 0.3  # [m/s], about the speed below which bodies do not rebound
 REBOUND_SPEED = 0.2  # least speed of approach that rebounds [m/s]: that of a fall of 4 mm, a hundredth of an object
-# Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner. For
-# points on a face it is larger: otherwise an edge that passes over them gives contacts with oblique normals.
+# Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
+# Larger for points on a face: otherwise an edge that passes over them gives contacts with oblique normals.
 MIN_FACING, MIN_FACING_OF_FACE = 0.3, 0.9
 CLOSEST_POINT_STEPS = 3  # to the point of a ball that is nearest to a surface
 SUBSTEPS = 4  # of rigid motion per step: contacts are linear in the motion, so a body may turn little in each

@@ -19,7 +19,7 @@ from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.force_field import ForceField
 from stages.core.models.field.solidity import MIN_STIFFNESS, box_sides, solidity
 from stages.core.models.field.solved_field import SolvedForceField
-from stages.core.models.initial_conditions import FLOOR, InitialConditions
+from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.materials import MODELS
@@ -30,9 +30,10 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.field_surfaces import body_surfaces
+from stages.simulate.held_bodies import HeldBodies
 from stages.simulate.model_units import TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
-from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
 from stages.simulate.sleep import SleepState
 from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
@@ -88,7 +89,7 @@ def rollout(
     if options.contact == "solved":
         if not isinstance(model, ForceField):
             raise InputError(f"--contact solved: not for weights of {card['model']}, only for those of the engine ngff")
-        floors = _floor_heights(per_object, setup)
+        floors = _floor_heights(per_object, setup, options)
         surfaces = body_surfaces(scene, initial, units, setup.lift, floors, options.seed)
         model = SolvedForceField(model, surfaces.to(device))
     in_model_units = ForcePrompts(units.forces(prompts.forces, setup.lift, ids), prompts.pinned)
@@ -102,8 +103,13 @@ def rollout(
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
     awake = _starts_awake(initial, units, setup)
-    sleep = SleepState(initial.to(device), awake, setup.on_floor)
-    log.info("%d of %d objects are at rest and stay fixed until touched", int(sleep.asleep.sum()), len(ids))
+    if options.contact == "solved":
+        awake |= not from_photos(scene)  # elsewhere nothing is missing that keeps them at rest
+        seen = centre_of_mass(initial, initial.points)[0] - units.length * setup.lift
+        rest = HeldBodies(initial, surfaces, seen, awake, setup.on_floor_as_seen)
+    else:
+        rest = SleepState(initial.to(device), awake, setup.on_floor)
+    log.info("%d of %d objects are at rest and stay fixed until touched", int(rest.asleep.sum()), len(ids))
     model_units = FieldUnits(
         units.length, units.scale, units.time, units.mass, tuple(units.origin.tolist()), units.gravity, steps,
         card["sha256"], options.friction,
@@ -116,7 +122,6 @@ def rollout(
         current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
         stepper = TimeStepper(model, initial.to(device), dt, forces.to(device), options.integrator)
         first, mass = stepper.points.clone(), initial.mass[0]
-        before = first
         for n in range(options.steps):
             moved = ((stepper.points - first) / units.length).cpu()
             check_motion(moved, n, options)
@@ -134,16 +139,11 @@ def rollout(
                 new = _changed(objects, current)
                 stepper.change(new.to(device))
                 mass = new.mass[0]
-            sleep.wake(_pushed(active, ids, start, end) | _woken(changes, ids))
-            stepper.external.pinned.copy_(_rows(held, ids) | sleep.asleep)
-            if bool(sleep.asleep.all()):
+            rest.wake(_pushed(active, ids, start, end) | _woken(changes, ids))
+            if bool(rest.asleep.all()):
                 stepper.step_count += steps
-                continue
-            for _ in range(steps):
-                stepper.step()
-            points = stepper.points.clone()
-            sleep.wake_on_impact(points, (points - before) / (steps * dt))
-            before = points
+            else:
+                rest.advance(stepper, steps, _rows(held, ids))
 
     return states()
 
@@ -176,7 +176,7 @@ def _initial_conditions(objects: FieldObjects, options: SimulateOptions) -> Init
     points, valid = torch.zeros(1, count, most, 3), torch.zeros(1, count, most, dtype=torch.bool)
     mass, E, ratio, nu, friction, loss = torch.ones(6, 1, count)
     fraction, inertia = torch.zeros(1, count, most), torch.zeros(1, count, 3, 3)
-    velocity, floors = torch.zeros(1, count, 3), _floor_heights(per_object, setup)
+    velocity, floors = torch.zeros(1, count, 3), _floor_heights(per_object, setup, options)
     for row, (o, p) in enumerate(zip(scene.objects, per_object, strict=True)):
         low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # points below the floor would be thrown up
         points[0, row, : len(p)] = units.to_model(p.maximum(low) + setup.lift[row])
@@ -209,13 +209,19 @@ def _initial_conditions(objects: FieldObjects, options: SimulateOptions) -> Init
     )  # fmt: skip
 
 
-def _floor_heights(per_object: list[Float[Tensor, "k 3"]], setup: SceneSetup) -> Float[Tensor, "o"]:
+def _floor_heights(
+    per_object: list[Float[Tensor, "k 3"]], setup: SceneSetup, options: SimulateOptions
+) -> Float[Tensor, "o"]:
     """Height of the floor under each object [scene units].
 
-    Standing objects keep their reconstructed height, since seats sag and undersides are not visible: their floor is at
-    their lowest keypoints, without outliers. On a common plane the lower objects would be lifted into others. An object
-    that stands on something else has the median floor of the standing ones.
+    With solved contacts it is that of the scene, which cuts off what is below, except for objects that are mostly below
+    it. With learned ones standing objects keep their reconstructed height, since seats sag and undersides are not
+    visible: their floor is at their lowest keypoints, without outliers. On a common plane the lower objects would be
+    lifted into others. An object that stands on something else has the median floor of the standing ones.
     """
+    if options.contact == "solved":
+        floor = setup.box.low[2]
+        return torch.tensor([float(p[:, 2].min()) if float(p[:, 2].median()) < floor else floor for p in per_object])
     ends = torch.stack([p[:, 2].quantile(FLOOR_OUTLIERS) for p in per_object]).maximum(setup.bottom)
     standing = setup.on_floor_as_seen
     usual = ends[standing].median() if bool(standing.any()) else torch.tensor(setup.box.low[2])

@@ -81,12 +81,7 @@ class RestingBodies:
         model = self._model
         wrench = data.qfrc_constraint.reshape(-1, FALLING)  # on held bodies, which are not turned: in world axes
         mass = model.body_mass[self._bodies]
-        load = -model.opt.gravity[2] * mass - wrench[:, 2]
-        push = np.hypot(wrench[:, 0], wrench[:, 1])
-        moment = np.hypot(wrench[:, 3] - self._height * wrench[:, 1], wrench[:, 4] + self._height * wrench[:, 0])
-        grip = np.maximum(load, 0)
-        excess = np.maximum(push - self._friction * grip, (moment - self._half_width * grip) / self._height)
-        excess = np.maximum(excess, -load)
+        excess = excess_force(wrench, -model.opt.gravity[2] * mass, self._friction, self._height, self._half_width)
         self._impulse = np.where(excess > 0, self._impulse + excess * model.opt.timestep, 0.0)
         moved = self.held & (self._impulse > mass * RELEASE_SPEED)
         return self.release(self._bodies[moved]) if moved.any() else []
@@ -109,6 +104,20 @@ class RestingBodies:
         return released
 
 
+def excess_force(
+    wrench: np.ndarray, weight: np.ndarray, friction: np.ndarray, height: np.ndarray, half_width: np.ndarray
+) -> np.ndarray:
+    """Force (k,) beyond what keeps bodies at rest, negative where none is, of the forces and torques about the centres
+    of mass (k, 6) that contacts exert on them; the other arguments (k,) are those of Stance.
+    """
+    load = weight - wrench[:, 2]
+    push = np.hypot(wrench[:, 0], wrench[:, 1])
+    moment = np.hypot(wrench[:, 3] - height * wrench[:, 1], wrench[:, 4] + height * wrench[:, 0])
+    grip = np.maximum(load, 0)
+    excess = np.maximum(push - friction * grip, (moment - half_width * grip) / height)
+    return np.maximum(excess, -load)
+
+
 def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
     """Body -> the bodies that rest on it: in contact from above and not on the floor, or without contact over it."""
     found: dict[int, set[int]] = {}
@@ -120,12 +129,12 @@ def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
             found.setdefault(int(lower), set()).add(int(upper))
     supported = set().union(*found.values())
     for i, s in enumerate(stances):
-        if not s.on_floor and i + 1 not in supported and (lower := _below(stances, i)) is not None:
+        if not s.on_floor and i + 1 not in supported and (lower := highest_below(stances, i)) is not None:
             found.setdefault(lower + 1, set()).add(i + 1)
     return found
 
 
-def _below(stances: list[Stance], row: int) -> int | None:
+def highest_below(stances: list[Stance], row: int) -> int | None:
     """The stance with the highest top of those that the middle of one is over."""
     own = stances[row]
     middle = (own.low + own.high) / 2

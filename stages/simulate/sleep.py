@@ -15,6 +15,7 @@ from torch import Tensor
 
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.initial_conditions import InitialConditions
+from stages.core.models.rollout import TimeStepper
 
 CONTACT_DISTANCE = 0.05  # distance at which objects touch, in addition to half the keypoint spacing [m]
 INITIAL_CONTACT_DISTANCE = 0.1  # the same at the start, as photos show little of contact regions [m]
@@ -35,6 +36,16 @@ class SleepState:
         self.in_contact = near | near.T
         self.standing, self.asleep = standing, ~awake
         self._wake_unsupported()
+        self._before = initial.points
+
+    def advance(self, stepper: TimeStepper, steps: int, pinned: Bool[Tensor, "o"]) -> None:
+        """Make the steps of a frame, with the objects `pinned` or asleep not moving, and wake those that are hit."""
+        stepper.external.pinned.copy_(pinned | self.asleep)
+        for _ in range(steps):
+            stepper.step()
+        points = stepper.points.clone()
+        self.wake_on_impact(points, (points - self._before) / (steps * stepper.dt))
+        self._before = points
 
     def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> None:
         """Wake objects hit by an awake object, and those that they supported.

@@ -1,6 +1,7 @@
 """Interoperability: Warp kernels on PyTorch tensors, devices and CUDA streams."""
 
 import os
+from collections.abc import Mapping
 from functools import cache
 
 import torch
@@ -78,3 +79,22 @@ def launch(
         record_tape=False,
         block_dim=block_dim,
     )
+
+
+def empty_arrays(struct, device: str, shape: tuple[int, ...], **other: tuple[int, ...] | None):
+    """An instance of a Warp struct with uninitialised arrays of this shape, or of that given for a field; None leaves
+    a field out.
+    """
+    out = struct()
+    for name, field in struct.vars.items():
+        if (size := other.get(name, shape)) is not None:
+            setattr(out, name, wp.empty(size, dtype=field.type.dtype, device=device))
+    return out
+
+
+def with_arrays(struct, tensors: Mapping[str, torch.Tensor]):
+    """The instance of a Warp struct with these contiguous tensors as arrays, 64-bit integers as 32-bit ones."""
+    for name, x in tensors.items():
+        x = x.int() if x.dtype == torch.int64 else x
+        setattr(struct, name, view(x.contiguous(), struct._cls.vars[name].type.dtype))
+    return struct

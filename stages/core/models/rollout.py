@@ -73,6 +73,18 @@ class TimeStepper:
         _load((self.initial,), (initial,))
         _load((self.scene,), (self.model.prepare(self.initial),))
 
+    def saved(self) -> list[Tensor]:
+        """A copy of what a step changes, for `restore`."""
+        return [x.clone() for x in self._changing]
+
+    def restore(self, saved: list[Tensor]) -> None:
+        """Return to the state that `saved` gave."""
+        torch._foreach_copy_(self._changing, saved)
+
+    @property
+    def _changing(self) -> list[Tensor]:
+        return [*self.state, self.points, self.step_count]
+
     def _prepared(self) -> tuple[Any, tuple, Tensor]:
         """The scene, its state at time 0 and the positions of its keypoints."""
         scene = self.model.prepare(self.initial)
@@ -94,10 +106,9 @@ class TimeStepper:
 
     def _captured_step(self) -> Callable[[], None]:
         """`_step` as a CUDA graph, with the state as before the capture, which takes some steps."""
-        changing = *self.state, self.points, self.step_count
-        before = [x.clone() for x in changing]
+        before = self.saved()
         replay = _captured(self._step)
-        torch._foreach_copy_(list(changing), before)
+        self.restore(before)
         return replay
 
 

@@ -8,19 +8,19 @@ from stages.core.kernels.operators import operator
 
 
 @wp.func
-def _matrix(quat: wp.vec4):
+def matrix(quat: wp.vec4):
     """Rotation matrix of a quaternion w x y z of any length."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(quat[1], quat[2], quat[3], quat[0])))
 
 
 @wp.func
-def _spin(momentum: wp.vec3, inverse: wp.mat33, R: wp.mat33):
+def spin_of(momentum: wp.vec3, inverse: wp.mat33, R: wp.mat33):
     """Angular velocity from angular momentum and the inverse inertia in the body frame."""
     return R * (inverse * (wp.transpose(R) * momentum))
 
 
 @wp.func
-def _rotated(quat: wp.vec4, rotation: wp.vec3):
+def rotated(quat: wp.vec4, rotation: wp.vec3):
     """Quaternion w x y z after the rotation vector `rotation` [rad] in world axes."""
     half = wp.sqrt(wp.length_sq(rotation) + 1.0e-24) / 2.0
     by = rotation * (wp.sin(half) / half / 2.0)
@@ -41,18 +41,18 @@ def _drift(
 ):
     i = wp.tid()
     q, L = quat[i], momentum[i]
-    spin = _spin(L, inverse[i], _matrix(q))
-    spin = _spin(L, inverse[i], _matrix(_rotated(q, dt / 2.0 * spin)))
+    spin = spin_of(L, inverse[i], matrix(q))
+    spin = spin_of(L, inverse[i], matrix(rotated(q, dt / 2.0 * spin)))
     new_com[i] = com[i] + dt * velocity[i]
-    new_quat[i] = _rotated(q, dt * spin)
+    new_quat[i] = rotated(q, dt * spin)
 
 
 @wp.kernel(enable_backward=False)
 def _pose(quat: wp.array[wp.vec4], momentum: wp.array[wp.vec3], inverse: wp.array[wp.mat33],
           R: wp.array[wp.mat33], spin: wp.array[wp.vec3]):  # fmt: skip
     i = wp.tid()
-    R[i] = _matrix(quat[i])
-    spin[i] = _spin(momentum[i], inverse[i], R[i])
+    R[i] = matrix(quat[i])
+    spin[i] = spin_of(momentum[i], inverse[i], R[i])
 
 
 def _rows(x: Tensor, dims: int, dtype) -> wp.array:
@@ -72,12 +72,12 @@ def drift(
     `momentum` is angular, `inverse` (..., 3, 3) the inverse inertia in the body frame, both per unit of mass.
     Reference: `stages.core.models.field.rigid_body.drift`.
     """
-    moved, rotated = com.new_empty(com.shape), quat.new_empty(quat.shape)
+    moved, turned = com.new_empty(com.shape), quat.new_empty(quat.shape)
     launch(_drift, com[..., 0].numel(), [
         _rows(com, 1, wp.vec3), _rows(quat, 1, wp.vec4), _rows(velocity, 1, wp.vec3), _rows(momentum, 1, wp.vec3),
         _rows(inverse, 2, wp.mat33), dt,
-    ], [_rows(moved, 1, wp.vec3), _rows(rotated, 1, wp.vec4)], device_of(com))  # fmt: skip
-    return moved, rotated
+    ], [_rows(moved, 1, wp.vec3), _rows(turned, 1, wp.vec4)], device_of(com))  # fmt: skip
+    return moved, turned
 
 
 def _pose_shapes(quat, momentum, inverse):

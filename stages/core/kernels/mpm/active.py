@@ -104,7 +104,7 @@ def contact_sweep(
         node = node_of_block(grid, here, t % BLOCK_NODES)
         at = _position(grid, node)
         if may_touch(grid, active.sharers, at[0], at[1], at[2]):
-            first = int(0)  # noqa: UP018 -- a literal would be constant in Warp
+            first = int(0)
             while active.marks[first * blocks + here] == 0:
                 first += 1
             if first == block // blocks:

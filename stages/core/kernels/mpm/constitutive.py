@@ -89,7 +89,7 @@ def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float)
     excess = 2.0 * mu * size - root * strength
     if excess <= 0.0:
         return wp.vec4(e[0], e[1], e[2], state)
-    resist = float(0.0)  # noqa: UP018 -- a literal would be constant in Warp
+    resist = float(0.0)
     if plastic[2] > 0.0:
         resist = plastic[2] / wp.max(dt, 1e-30)  # dt = 0: no viscoplastic flow
     flow = wp.min(excess / (2.0 * mu + 2.0 / 3.0 * hardening + resist), size)

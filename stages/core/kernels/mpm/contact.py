@@ -203,7 +203,7 @@ def resolve_node(
     """Contact at a node between those of the bodies `present[start:stop]` that reach it; `clear` clears their keys."""
     node = (i * grid.nodes[1] + j) * grid.nodes[2] + k
     place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))
-    here = int(0)  # noqa: UP018 -- a literal would be constant in Warp
+    here = int(0)
     for p in range(start, stop):
         here += wp.where(nearest[present[p] * grid.count + node] < NONE, 1, 0)
     for _ in range(wp.where(here > 2, SWEEPS, wp.where(here > 1, 1, 0))):
@@ -243,7 +243,7 @@ def find_nearest(grid: MpmGrid, rows: ParticleArrays, sharers: wp.array[int], ne
     base = first_node(g)
     block = wp.vec3i(base[0] // BLOCK, base[1] // BLOCK, base[2] // BLOCK)
     last = wp.vec3i((base[0] + 2) // BLOCK, (base[1] + 2) // BLOCK, (base[2] + 2) // BLOCK)
-    near = int(0)  # noqa: UP018 -- a literal would be constant in Warp; a bit for each of up to eight blocks
+    near = int(0)  # a bit for each of up to eight blocks
     for a in range(block[0], last[0] + 1):
         for b in range(block[1], last[1] + 1):
             for c in range(block[2], last[2] + 1):

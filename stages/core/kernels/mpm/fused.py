@@ -49,7 +49,7 @@ def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
     """Add node n (0..26) to the G2P sums `s`; computes its weight, for loops that are not unrolled."""
     at = wp.vec3(float(n // 9), float((n // 3) % 3), float(n % 3))
     d = at - fx
-    w = float(1.0)  # noqa: UP018 -- a literal would be constant in Warp
+    w = float(1.0)
     for axis in range(3):
         away = wp.abs(d[axis])
         w *= wp.where(away < 0.5, 0.75 - away * away, 0.5 * (1.5 - away) * (1.5 - away))
@@ -170,7 +170,7 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
         dt = clock[0]
         stride_y = grid.nodes[2]
         stride_x = grid.nodes[1] * grid.nodes[2]
-        first = int(-1)  # noqa: UP018 -- a literal would be constant in Warp
+        first = int(-1)
         fx = wp.vec3(1.0, 1.0, 1.0)
         load = wp.mat44()
         held = int(LOST)

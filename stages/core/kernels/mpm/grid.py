@@ -160,7 +160,7 @@ def _outwards(obstacle: Obstacle, arm: wp.vec3, turn: wp.quat) -> wp.vec4:
         if length > 1e-9:
             normal = local / length
     if obstacle.kind == BOX:
-        distance = float(-1e30)  # noqa: UP018 -- a literal would be constant in Warp
+        distance = float(-1e30)
         for axis in range(3):
             gap = wp.abs(local[axis]) - obstacle.size[axis]
             if gap > distance:
@@ -184,7 +184,7 @@ def _surface_at(obstacle: Obstacle, place: wp.vec3, time: float) -> wp.vec4:
 @wp.func
 def near_obstacles(place: wp.vec3, obstacles: wp.array[Obstacle], time: float, radius: float) -> bool:
     """Whether a point within `radius` [m] of a position along each axis may lie in an obstacle."""
-    near = float(1e30)  # noqa: UP018 -- a literal would be constant in Warp
+    near = float(1e30)
     for n in range(obstacles.shape[0]):
         near = wp.min(near, _surface_at(obstacles[n], place, time)[3])
     return near < 1.75 * radius
@@ -252,7 +252,7 @@ def apply_boundaries(
     """Apply walls and obstacles to the velocities of a row of four nodes, the first of which is `at`."""
     inside = at[0] > grid.low[0] and at[0] < grid.high[0] and at[1] > grid.low[1] and at[1] < grid.high[1]
     inside = inside and at[2] > grid.low[2] and at[2] + BLOCK <= grid.high[2]
-    blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
+    blocked = bool(False)
     if obstacles.shape[0] > 0:
         middle = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]) + 1.5)
         blocked = near_obstacles(middle, obstacles, time, 2.0 * grid.dx)

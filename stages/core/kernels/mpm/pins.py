@@ -32,7 +32,7 @@ def pin_nodes(pins: PinnedNodes, velocity: wp.array[wp.vec4]):
     n = wp.tid()
     master = pins.masters[n]
     momentum = wp.vec3()
-    mass = float(0.0)  # noqa: UP018 -- a literal would be constant in Warp
+    mass = float(0.0)
     if master >= 0:
         own = velocity[master]
         mass = own[3]

@@ -1,4 +1,4 @@
-"""Surfaces of the bodies of a scene for contacts: signed distances on grids, and keypoints that stand for the surface.
+"""Surfaces of the bodies of a scene for contacts: signed distances on grids, and samples.
 
 A body's grid is in its frame, undeformed.
 Source: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
@@ -14,6 +14,7 @@ from itertools import product
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 NEIGHBOURS = 6  # samples, with itself, whose normals decide whether one is on a face
 FACE_COSINE = 0.97  # least length of the mean of their normals, .71 at a cube's edges and .58 at its corners
@@ -29,7 +30,9 @@ class BodyGrid:
     keypoint: Int[Tensor, "x y z"]  # nearest one
     low: Float[Tensor, "3"]  # the first node
     spacing: float
-    samples: Int[Tensor, "k"]  # keypoints that stand for the surface
+    samples: Float[Tensor, "k 3"]  # points on the surface in the body's frame
+    normals: Float[Tensor, "k 3"]  # there, outwards
+    near: Int[Tensor, "k"]  # keypoint near each
     ball: tuple[Float[Tensor, "3"], float] | None = None  # its centre and radius, if the body is one
 
 
@@ -44,44 +47,37 @@ class BodySurfaces:
     shape: Int[Tensor, "o 3"]
     low: Float[Tensor, "o 3"]
     spacing: Float[Tensor, "o"]
-    samples: Int[Tensor, "o k"]  # keypoints; -1 where padded
-    normals: Float[Tensor, "o k 3"]  # outwards, in the body's frame
+    near: Int[Tensor, "o k"]  # keypoint near each sample; -1 where padded
+    samples: Float[Tensor, "o k 3"]  # points on the surface in the body's frame [m]
+    normals: Float[Tensor, "o k 3"]  # outwards
     flat: Bool[Tensor, "o k"]  # on a face
     centre: Float[Tensor, "o 3"]  # of a ball
     radius: Float[Tensor, "o"]  # of a ball; 0 for other bodies
+    reach: Float[Tensor, "o"]  # of the samples about the centre of mass [m]
     overlap: Float[Tensor, "o o"]  # of each body with another at the start, which is no contact [m]
 
     @classmethod
-    def of(cls, grids: Sequence[BodyGrid], arm: Float[Tensor, "o n 3"]) -> BodySurfaces:
-        """The surfaces of bodies whose keypoints are at `arm` in their frames; without overlaps."""
-        most = max(len(g.samples) for g in grids)
-        samples = torch.full((len(grids), most), -1)
-        for row, g in enumerate(grids):
-            samples[row, : len(g.samples)] = g.samples
+    def of(cls, grids: Sequence[BodyGrid]) -> BodySurfaces:
+        """The surfaces of bodies; without overlaps."""
         sizes = torch.tensor([g.depth.numel() for g in grids])
         flat = {n: torch.cat([getattr(g, n).flatten() for g in grids]) for n in ("depth", "smooth", "keypoint")}
-        out = cls(
+        at, normals, near = (
+            pad_sequence([getattr(g, n) for g in grids], batch_first=True, padding_value=padding)
+            for n, padding in (("samples", 0.0), ("normals", 0.0), ("near", -1))
+        )
+        none = at.new_zeros(3), 0.0
+        balls = [none if g.ball is None else g.ball for g in grids]
+        return cls(
             **flat, first=sizes.cumsum(0) - sizes, shape=torch.tensor([g.depth.shape for g in grids]),
-            low=torch.stack([g.low for g in grids]), spacing=torch.tensor([g.spacing for g in grids]).to(arm),
-            samples=samples, normals=arm.new_zeros(len(grids), most, 3),
-            flat=torch.zeros_like(samples, dtype=torch.bool),
-            centre=torch.stack([arm.new_zeros(3) if g.ball is None else g.ball[0] for g in grids]),
-            radius=arm.new_tensor([0.0 if g.ball is None else g.ball[1] for g in grids]),
-            overlap=arm.new_zeros(len(grids), len(grids)),
+            low=torch.stack([g.low for g in grids]), spacing=at.new_tensor([g.spacing for g in grids]),
+            near=near, samples=at, normals=normals, flat=_flat(at, normals, near >= 0),
+            centre=torch.stack([centre for centre, _ in balls]), radius=at.new_tensor([radius for _, radius in balls]),
+            reach=at.norm(dim=-1).amax(-1), overlap=at.new_zeros(len(grids), len(grids)),
         )  # fmt: skip
-        body = torch.arange(len(grids))[:, None].expand_as(samples)
-        at = arm[body, samples.clamp_min(0)]
-        normals = -out.look_up(body.flatten(), at.flatten(0, 1))[1].view_as(at)
-        return replace(out, normals=normals, flat=_flat(at, normals, samples >= 0))
 
     def to(self, device: torch.device | str) -> BodySurfaces:
         """A copy on another device."""
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
-    def nearest_keypoint(self, body: Int[Tensor, "r"], x: Float[Tensor, "r 3"]) -> Int[Tensor, "r"]:
-        """The keypoint near points x in the frames of bodies [m]."""
-        node = ((x - self.low[body]) / self.spacing[body, None]).round().long().clamp_min(0)
-        return self.keypoint[self._row(body, node.minimum(self.shape[body] - 1))]
 
     def look_up(
         self, body: Int[Tensor, "r"], x: Float[Tensor, "r 3"]

@@ -1,4 +1,4 @@
-"""Contacts of rigid bodies, solved for the velocities at the end of a step: no penetration, and Coulomb's friction.
+"""The solver of `stages.core.kernels.field.contact_solve` by PyTorch, for one scene.
 
 With M for the bodies' inertia, the velocities v minimise the convex function
 
@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-NORMAL_REGULARISATION, FRICTION_REGULARISATION = 1e-3, 1e-4  # of the inverse effective mass
+NORMAL_REGULARISATION, FRICTION_REGULARISATION = 1e-3, 1e-3  # of the inverse effective mass
 ROUNDS = 5  # of the fixed point, at most
 ITERATIONS = 20  # of Newton's method in each round, at most
 TOLERANCE = 1e-6  # change of velocities at which both end [m/s]

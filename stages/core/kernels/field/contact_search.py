@@ -1,0 +1,340 @@
+"""Contact points of rigid bodies, a group of threads for each scene: samples of one surface near another.
+
+Of the samples of a body near another one, or near a plane, those are kept that span the contact in eight directions
+across its normal, and the deepest: for each of six directions of the normal, in world axes. The others lie within the
+polygon of these and would bear a load that these can bear. A sample counts for less by ten times its gap, so that those
+that touch come before those that only may.
+Source: manifold reduction by extremes: Moravanszky and Terdiman 2004, "Fast contact reduction for dynamics simulation".
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
+EXTREMES = wp.constant(9)  # kept of each: in eight directions, and the deepest
+SLOTS = wp.constant(6 * 9)
+NONE = wp.constant(-1)
+DIAGONAL = wp.constant(0.70710678)
+GAP_WEIGHT = wp.constant(10.0)  # of a gap against the distance along a direction
+MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the way of a step [m]; a tenth of an object
+# Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
+# Larger for points on a face: otherwise an edge that passes over them gives contacts with oblique normals.
+MIN_FACING, MIN_FACING_OF_FACE = wp.constant(0.3), wp.constant(0.9)
+CLOSEST_POINT_STEPS = wp.constant(3)  # to the point of a ball that is nearest to a surface
+
+
+@wp.struct
+class SurfaceArrays:
+    """BodySurfaces for kernels; its docstring has the fields."""
+
+    depth: wp.array[float]
+    smooth: wp.array[float]
+    keypoint: wp.array[int]
+    first: wp.array[int]
+    shape: wp.array[wp.vec3i]
+    low: wp.array[wp.vec3]
+    spacing: wp.array[float]
+    near: wp.array2d[int]
+    samples: wp.array2d[wp.vec3]
+    normals: wp.array2d[wp.vec3]
+    flat: wp.array2d[wp.bool]
+    centre: wp.array[wp.vec3]
+    radius: wp.array[float]
+    reach: wp.array[float]
+    overlap: wp.array2d[float]
+
+
+@wp.struct
+class BodyPoses:
+    """Where the bodies of each scene are."""
+
+    com: wp.array2d[wp.vec3]
+    R: wp.array2d[wp.mat33]
+    low: wp.array2d[wp.vec3]  # the room of each body
+    high: wp.array2d[wp.vec3]
+    margin: wp.array2d[float]  # gap up to which contacts are looked for [m]
+    pinned: wp.array2d[wp.bool]
+
+
+@wp.struct
+class Found:
+    """What was found for each pair of bodies; the pair of a body with itself stands for the planes around it."""
+
+    score: wp.array2d[float]  # of each slot
+    row: wp.array2d[int]  # sample in each slot
+    gap: wp.array3d[float]  # of the samples of each pair
+    count: wp.array2d[int]  # contacts of each pair
+
+
+@wp.struct
+class NearPoint:
+    """A point of body a near body b or near a plane."""
+
+    at: wp.vec3  # of a [m]
+    gap: float  # [m]
+    normal: wp.vec3  # of b, towards a
+    keypoint: int  # of a
+    other: int  # of b, near it
+    facing: bool  # whether both surfaces face each other
+
+
+@wp.func
+def _node(s: SurfaceArrays, body: int, i: int, j: int, k: int) -> int:
+    n = s.shape[body]
+    return s.first[body] + (i * n[1] + j) * n[2] + k
+
+
+@wp.func
+def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
+    """Direction of steepest increase, and depth, at x in the frame of a body; see BodySurfaces.look_up."""
+    n = s.shape[body]
+    h = s.spacing[body]
+    place = (x - s.low[body]) / h
+    f = wp.vec3()
+    cell = wp.vec3i()
+    beyond = float(0.0)
+    for axis in range(3):
+        inside = wp.clamp(place[axis], 0.0, float(n[axis] - 1))
+        cell[axis] = wp.min(int(inside), n[axis] - 2)
+        f[axis] = inside - float(cell[axis])
+        beyond += (place[axis] - inside) * (place[axis] - inside) * h * h
+    depth = float(0.0)
+    slope = wp.vec3()
+    for corner in range(8):
+        i = corner // 4
+        j = (corner // 2) % 2
+        k = corner % 2
+        u = wp.where(i == 1, f[0], 1.0 - f[0])
+        v = wp.where(j == 1, f[1], 1.0 - f[1])
+        w = wp.where(k == 1, f[2], 1.0 - f[2])
+        row = _node(s, body, cell[0] + i, cell[1] + j, cell[2] + k)
+        depth += s.depth[row] * u * v * w
+        smooth = s.smooth[row]
+        slope += smooth * wp.vec3(float(2 * i - 1) * v * w, float(2 * j - 1) * u * w, float(2 * k - 1) * u * v)
+    if beyond > 0.0:  # the body is in the box of its grid, so the angle at the box's nearest point is at least right
+        outside = wp.min(depth, 0.0)
+        depth = -wp.sqrt(beyond + outside * outside)
+    slope = slope / wp.max(wp.length(slope), 1.0e-12)
+    return wp.vec4(slope[0], slope[1], slope[2], depth)
+
+
+@wp.func
+def _beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
+    """How far x in the frame of a body is from the box of its grid, along one axis."""
+    low = s.low[body]
+    out = float(0.0)
+    for axis in range(3):
+        end = low[axis] + s.spacing[body] * float(s.shape[body][axis] - 1)
+        out = wp.max(out, wp.max(low[axis] - x[axis], x[axis] - end))
+    return out
+
+
+@wp.func
+def nearest_keypoint(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
+    """The keypoint near x in the frame of a body."""
+    n = s.shape[body]
+    place = (x - s.low[body]) / s.spacing[body]
+    i = wp.clamp(int(wp.round(place[0])), 0, n[0] - 1)
+    j = wp.clamp(int(wp.round(place[1])), 0, n[1] - 1)
+    k = wp.clamp(int(wp.round(place[2])), 0, n[2] - 1)
+    return s.keypoint[_node(s, body, i, j, k)]
+
+
+@wp.func
+def _inward(side: int) -> wp.vec3:
+    """Normal of a plane of the room."""
+    out = wp.vec3()
+    out[side % 3] = wp.where(side < 3, 1.0, -1.0)
+    return out
+
+
+@wp.func
+def _plane_gap(poses: BodyPoses, scene: int, a: int, side: int, x: wp.vec3) -> float:
+    axis = side % 3
+    if side < 3:
+        return x[axis] - poses.low[scene, a][axis]
+    return poses.high[scene, a][axis] - x[axis]
+
+
+@wp.func
+def _local(poses: BodyPoses, scene: int, body: int, x: wp.vec3) -> wp.vec3:
+    return wp.transpose(poses.R[scene, body]) * (x - poses.com[scene, body])
+
+
+@wp.func
+def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, q: int) -> NearPoint:
+    """Sample q of body a at body b."""
+    out = NearPoint()
+    R = poses.R[scene, b]
+    out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+    x = _local(poses, scene, b, out.at)
+    found = depth_at(s, b, x)
+    out.normal = -(R * wp.vec3(found[0], found[1], found[2]))
+    out.gap = s.overlap[a, b] - found[3]
+    own = poses.R[scene, a] * s.normals[a, q]
+    out.facing = -wp.dot(own, out.normal) > MIN_FACING
+    if s.flat[a, q]:  # under an edge of b, whose own normal is oblique
+        out.normal = -own
+    out.keypoint = s.near[a, q]
+    out.other = NONE
+    return out
+
+
+@wp.func
+def ball_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) -> NearPoint:
+    """The point of a ball a that is nearest to body b."""
+    out = NearPoint()
+    centre = poses.com[scene, a] + poses.R[scene, a] * s.centre[a]
+    apart = centre - (poses.com[scene, b] + poses.R[scene, b] * s.centre[b])
+    out.normal = wp.normalize(apart)
+    out.gap = wp.length(apart) - s.radius[a] - s.radius[b]
+    out.at = centre - s.radius[a] * out.normal
+    if s.radius[b] == 0.0:
+        for _ in range(CLOSEST_POINT_STEPS):
+            found = depth_at(s, b, _local(poses, scene, b, out.at))
+            out.gap = -found[3]
+            out.normal = -(poses.R[scene, b] * wp.vec3(found[0], found[1], found[2]))
+            out.at = centre - s.radius[a] * out.normal
+    out.gap += s.overlap[a, b]
+    out.keypoint = nearest_keypoint(s, a, _local(poses, scene, a, out.at))
+    out.facing = True
+    return out
+
+
+@wp.func
+def plane_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, side: int, q: int) -> NearPoint:
+    """Sample q of body a, or the point of a ball, at a plane."""
+    out = NearPoint()
+    out.normal = _inward(side)
+    if s.radius[a] > 0.0:
+        out.at = poses.com[scene, a] + poses.R[scene, a] * s.centre[a] - s.radius[a] * out.normal
+        out.keypoint = nearest_keypoint(s, a, _local(poses, scene, a, out.at))
+    else:
+        out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+        out.keypoint = s.near[a, q]
+    out.gap = _plane_gap(poses, scene, a, side, out.at)
+    out.other = NONE
+    out.facing = True
+    return out
+
+
+@wp.func
+def _side_of(normal: wp.vec3) -> int:
+    """The axis nearest to a normal."""
+    axis = int(0)
+    for i in range(1, 3):
+        if wp.abs(normal[i]) > wp.abs(normal[axis]):
+            axis = i
+    return wp.where(normal[axis] < 0.0, axis + 3, axis)
+
+
+@wp.func
+def _offer(found: Found, scene: int, pair: int, side: int, q: int, near: NearPoint, com: wp.vec3):
+    """Keep a sample where it is the best in one of the directions."""
+    arm = near.at - com
+    u = arm[(side + 1) % 3]
+    v = arm[(side + 2) % 3]
+    lost = GAP_WEIGHT * wp.max(near.gap, 0.0)
+    first = pair * SLOTS + side * EXTREMES
+    for k in range(EXTREMES):
+        value = -near.gap
+        if k < EXTREMES - 1:
+            if k // 4 == 0:  # diagonals
+                value = DIAGONAL * (wp.where(k < 2, u, -u) + wp.where(k % 2 == 0, v, -v)) - lost
+            elif k < 6:
+                value = wp.where(k == 4, u, -u) - lost
+            else:
+                value = wp.where(k == 6, v, -v) - lost
+        if value > found.score[scene, first + k]:
+            found.score[scene, first + k] = value
+            found.row[scene, first + k] = q
+
+
+@wp.func
+def _distinct(found: Found, scene: int, pair: int) -> int:
+    """Empty slots whose sample is in an earlier one of the same side; the number of the others."""
+    count = int(0)
+    for slot in range(SLOTS):
+        at = pair * SLOTS + slot
+        for other in range(slot - slot % EXTREMES, slot):
+            if found.row[scene, pair * SLOTS + other] == found.row[scene, at]:
+                found.row[scene, at] = NONE
+        if found.row[scene, at] != NONE:
+            count += 1
+    return count
+
+
+@wp.func
+def search_pair(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, a: int, b: int):
+    """Find the contacts of bodies a with b, or with the planes if b = a; sets slots, gaps and the count."""
+    bodies = s.samples.shape[0]
+    samples = s.samples.shape[1]
+    pair = a * bodies + b
+    found.count[scene, pair] = 0
+    if poses.pinned[scene, a] and (a == b or poses.pinned[scene, b]):
+        return
+    com = poses.com[scene, a]
+    margin = poses.margin[scene, a]
+    near = bool(False)
+    if a == b:
+        for side in range(SIDES):
+            near = near or _plane_gap(poses, scene, a, side, com) < s.reach[a] + margin
+    else:
+        margin += poses.margin[scene, b]
+        near = wp.length(com - poses.com[scene, b]) < s.reach[a] + s.reach[b] + margin
+    round_ = s.radius[a] > 0.0
+    if a != b and s.radius[b] > 0.0:  # b's contact is that with a
+        near = near and round_ and a < b
+    if not near:
+        return
+    for slot in range(SLOTS):
+        found.row[scene, pair * SLOTS + slot] = NONE
+        found.score[scene, pair * SLOTS + slot] = -1.0e30
+    for q in range(samples):
+        found.gap[scene, pair, q] = 1.0e30
+        if s.near[a, q] != NONE:
+            if a == b:
+                for side in range(SIDES):
+                    gap = _plane_gap(poses, scene, a, side, com + poses.R[scene, a] * s.samples[a, q])
+                    if gap < margin:
+                        found.gap[scene, pair, q] = wp.min(gap, found.gap[scene, pair, q])
+                        if not round_:
+                            _offer(found, scene, pair, side, q, plane_near(s, poses, scene, a, side, q), com)
+            elif _beyond_grid(s, b, _local(poses, scene, b, com + poses.R[scene, a] * s.samples[a, q])) < margin:
+                point = sample_near(s, poses, scene, a, b, q)
+                if point.gap < margin and point.facing:
+                    found.gap[scene, pair, q] = point.gap
+                    if not round_:
+                        _offer(found, scene, pair, _side_of(point.normal), q, point, com)
+    if not round_:
+        found.count[scene, pair] = _distinct(found, scene, pair)
+        return
+    count = int(0)  # a ball has one contact with a body or plane
+    if a == b:
+        for side in range(SIDES):
+            if plane_near(s, poses, scene, a, side, 0).gap < margin:
+                found.row[scene, pair * SLOTS + side * EXTREMES] = 0
+                count += 1
+    elif ball_near(s, poses, scene, a, b).gap < margin:
+        found.row[scene, pair * SLOTS] = 0
+        count += 1
+    found.count[scene, pair] = count
+
+
+@wp.func
+def contact_in_slot(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, slot: int) -> NearPoint:
+    """The contact that `search_pair` has put there."""
+    a = pair // s.samples.shape[0]
+    b = pair % s.samples.shape[0]
+    q = found.row[scene, pair * SLOTS + slot]
+    out = NearPoint()
+    if a == b:
+        out = plane_near(s, poses, scene, a, slot // EXTREMES, q)
+    elif s.radius[a] > 0.0:
+        out = ball_near(s, poses, scene, a, b)
+    else:
+        out = sample_near(s, poses, scene, a, b, q)
+    if a != b:
+        out.other = nearest_keypoint(s, b, _local(poses, scene, b, out.at))
+    return out

@@ -1,0 +1,392 @@
+"""Rigid motion with solved contacts: one launch for all substeps of a frame, a group of threads for each scene.
+
+On a GPU a group is a block of threads; on the CPU it is one thread, so that scenes are simulated one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.core.kernels.field.contact_search import (
+    MARGIN,
+    NONE,
+    SLOTS,
+    Found,
+    BodyPoses,
+    SurfaceArrays,
+    contact_in_slot,
+    nearest_keypoint,
+    search_pair,
+)
+from stages.core.kernels.field.contact_solve import (
+    FRICTION_REGULARISATION,
+    NORMAL_REGULARISATION,
+    Contacts,
+    Inertias,
+    SolverMemory,
+    Velocities,
+    effective_response,
+    solve,
+    solver_arrays,
+    wait_for_group,
+)
+from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
+from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays
+
+f64 = wp.float64
+GROUP = 128  # threads of a scene on a GPU
+CONTACTS_PER_BODY = 512  # room for contacts; more are left out
+RECOVERY = wp.constant(0.2)  # share of an overlap that is removed in a step (Baumgarte 1972)
+MAX_RECOVERY_SPEED = wp.constant(0.3)  # [m/s], about the speed below which bodies do not rebound
+REBOUND_SPEED = wp.constant(0.2)  # least speed of approach that rebounds [m/s]: of a fall of a hundredth of an object
+ROUGHNESS = wp.constant(0.005)  # gap up to which points take part in an impact, as surfaces are known to [m]
+PATCH = wp.constant(0.02)  # samples with gaps this much larger than the least share a contact's force [m]
+HALF_PI = wp.constant(math.pi / 2)
+
+
+@wp.struct
+class BodyProperties:
+    """Properties of the bodies of each scene."""
+
+    mass: wp.array2d[float]  # [kg]
+    inertia: wp.array2d[wp.mat33]  # per unit of mass, rest orientation [m^2]
+    inverse: wp.array2d[wp.mat33]
+    friction: wp.array2d[float]
+    loss: wp.array2d[float]
+    acceleration: wp.array2d[wp.vec3]  # without contact, of the centres of mass [m/s^2]
+    twist: wp.array2d[wp.vec3]  # torque per unit of mass [m^2/s^2]
+    mass_fraction: wp.array3d[float]  # of keypoints
+
+
+@wp.struct
+class BodyMotion:
+    """State of the bodies of each scene."""
+
+    com: wp.array2d[wp.vec3]
+    quat: wp.array2d[wp.vec4]
+    velocity: wp.array2d[wp.vec3]
+    momentum: wp.array2d[wp.vec3]  # angular, per unit of mass
+    spin: wp.array2d[wp.vec3]
+
+
+@wp.struct
+class Patches:
+    """How contacts are spread over keypoints: of each pair, with impulses J at x, W nodes of mean place m."""
+
+    centre: wp.array2d[wp.vec3]  # m
+    nodes: wp.array2d[int]  # W
+    spread: wp.array2d[wp.mat33]  # inverse of the nodes' second moments
+    force: wp.array2d[wp.vec3]  # sum of J
+    torque: wp.array2d[wp.vec3]  # sum of (x - m) x J
+    accelerations: wp.array3d[wp.vec3]  # of keypoints in the bodies' frames; the result
+    load: wp.array2d[wp.vec3]  # sum of all impulses on each body; the result
+    moment: wp.array2d[wp.vec3]  # that about its centre of mass
+
+
+@wp.func
+def _double(x: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(f64(x[0]), f64(x[1]), f64(x[2]))
+
+
+@wp.func
+def _single(x: wp.vec3d) -> wp.vec3:
+    return wp.vec3(float(x[0]), float(x[1]), float(x[2]))
+
+
+@wp.func
+def _double_matrix(x: wp.mat33) -> wp.mat33d:
+    out = wp.mat33d()
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = f64(x[i, j])
+    return out
+
+
+@wp.func
+def _drifted(m: BodyMotion, bodies: BodyProperties, scene: int, i: int, h: float):
+    """Free motion of a body for h [s]."""
+    quat = m.quat[scene, i]
+    L = m.momentum[scene, i]
+    inverse = bodies.inverse[scene, i]
+    spin = spin_of(L, inverse, matrix(quat))
+    spin = spin_of(L, inverse, matrix(rotated(quat, h / 2.0 * spin)))
+    m.com[scene, i] = m.com[scene, i] + h * m.velocity[scene, i]
+    m.quat[scene, i] = rotated(quat, h * spin)
+
+
+@wp.func
+def _begin(
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, inertia: Inertias, v: Velocities, free: Velocities,
+    scene: int, i: int, h: float,
+):  # fmt: skip
+    """The first half of a substep for body i, and its velocities without contact."""
+    _drifted(m, bodies, scene, i, h / 2.0)
+    R = matrix(m.quat[scene, i])
+    inverse = bodies.inverse[scene, i]
+    mass = f64(bodies.mass[scene, i])
+    spin = spin_of(m.momentum[scene, i], inverse, R)
+    later = spin_of(m.momentum[scene, i] + h * bodies.twist[scene, i], inverse, R)
+    m.spin[scene, i] = spin
+    poses.R[scene, i] = R
+    poses.margin[scene, i] = MARGIN + h * (wp.length(m.velocity[scene, i]) + wp.length(spin) * s.reach[i])
+    turn = _double_matrix(R)
+    inertia.tensor[scene, i] = mass * (turn * _double_matrix(bodies.inertia[scene, i]) * wp.transpose(turn))
+    inertia.inverse[scene, i] = turn * _double_matrix(inverse) * wp.transpose(turn) / mass
+    v.linear[scene, i] = _double(m.velocity[scene, i])
+    v.angular[scene, i] = _double(spin)
+    free.linear[scene, i] = wp.vec3d()
+    free.angular[scene, i] = wp.vec3d()
+    if not poses.pinned[scene, i]:
+        free.linear[scene, i] = _double(m.velocity[scene, i] + h * bodies.acceleration[scene, i])
+        free.angular[scene, i] = _double(later)
+
+
+@wp.func
+def _add_contact(
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias, c: Contacts,
+    scene: int, pair: int, slot: int, i: int, h: float,
+):  # fmt: skip
+    """Write the contact of a slot as contact i."""
+    a = pair // s.samples.shape[0]
+    b = pair % s.samples.shape[0]
+    near = contact_in_slot(s, poses, found, scene, pair, slot)
+    at = near.at
+    if b != a:
+        at = near.at - near.gap / 2.0 * near.normal
+    arm_a = at - poses.com[scene, a]
+    arm_b = at - poses.com[scene, b]
+    speed = m.velocity[scene, a] + wp.cross(m.spin[scene, a], arm_a)
+    pull = bodies.acceleration[scene, a]
+    loss = bodies.loss[scene, a]
+    friction = bodies.friction[scene, a]
+    response = effective_response(inertia, scene, a, _double(arm_a))
+    if b != a:
+        speed -= m.velocity[scene, b] + wp.cross(m.spin[scene, b], arm_b)
+        pull -= bodies.acceleration[scene, b]
+        loss = wp.max(loss, bodies.loss[scene, b])
+        friction = wp.max(friction, bodies.friction[scene, b])
+        response += effective_response(inertia, scene, b, _double(arm_b))
+    approach = wp.dot(speed, near.normal)
+    gained = h / 2.0 * wp.dot(pull, near.normal)  # until the middle of the step, and again after it
+    target = -near.gap / h
+    if near.gap <= 0.0:
+        target = wp.min(-RECOVERY / h * near.gap, MAX_RECOVERY_SPEED)
+    if approach < -REBOUND_SPEED and near.gap + h * approach < ROUGHNESS:
+        target = wp.max(target, gained - wp.exp(-HALF_PI * loss) * (approach + gained))
+    c.normal[scene, i] = _double(near.normal)
+    c.arm_a[scene, i] = _double(arm_a)
+    c.arm_b[scene, i] = _double(arm_b)
+    c.target[scene, i] = f64(target)
+    c.friction[scene, i] = f64(friction)
+    c.R_n[scene, i] = NORMAL_REGULARISATION * response
+    c.R_t[scene, i] = FRICTION_REGULARISATION * response
+
+
+@wp.func
+def _end(bodies: BodyProperties, m: BodyMotion, poses: BodyPoses, v: Velocities, scene: int, i: int, h: float):
+    """The second half of a substep."""
+    velocity = _single(v.linear[scene, i])
+    R = poses.R[scene, i]
+    momentum = R * (bodies.inertia[scene, i] * (wp.transpose(R) * _single(v.angular[scene, i])))
+    if poses.pinned[scene, i]:
+        velocity = wp.vec3()
+        momentum = wp.vec3()
+    m.velocity[scene, i] = velocity
+    m.momentum[scene, i] = momentum
+    _drifted(m, bodies, scene, i, h / 2.0)
+
+
+@wp.func
+def _place(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, q: int) -> wp.vec3:
+    return poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+
+
+@wp.func
+def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches, scene: int, pair: int):
+    """Force and torque of the contacts of a pair, and the nodes that they are spread over."""
+    a = pair // s.samples.shape[0]
+    least = float(1.0e30)
+    samples = s.samples.shape[1]
+    for q in range(samples):
+        least = wp.min(least, found.gap[scene, pair, q])
+    nodes = int(0)
+    centre = wp.vec3()
+    for q in range(samples):
+        if found.gap[scene, pair, q] < least + PATCH:
+            nodes += 1
+            centre += _place(s, poses, scene, a, q)
+    centre = centre / float(wp.max(nodes, 1))
+    moment = wp.mat33()
+    for q in range(samples):
+        if found.gap[scene, pair, q] < least + PATCH:
+            arm = _place(s, poses, scene, a, q) - centre
+            moment += wp.dot(arm, arm) * wp.identity(3, dtype=float) - wp.outer(arm, arm)
+    force = wp.vec3()
+    torque = wp.vec3()
+    for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
+        J = _single(c.impulse[scene, i])
+        force += J
+        torque += wp.cross(_single(c.arm_a[scene, i]) + poses.com[scene, a] - centre, J)
+    trace = wp.trace(moment)
+    patches.nodes[scene, pair] = nodes
+    patches.centre[scene, pair] = centre
+    # a multiple of the identity: nodes on a line cannot bear a torque about it
+    patches.spread[scene, pair] = wp.inverse(moment + (1.0e-2 * trace + 1.0e-9) * wp.identity(3, dtype=float))
+    patches.force[scene, pair] = force
+    patches.torque[scene, pair] = torque
+
+
+@wp.func
+def _spread_over(
+    bodies: BodyProperties, s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches, scene: int, i: int,
+    pair: int, weight: float,
+):  # fmt: skip
+    """Add the accelerations of body i's keypoints by the contacts of a pair, times `weight`.
+
+    Forces and torques are divided among the nodes as by interpolation elements (RBE3) of finite-element codes.
+    """
+    a = pair // s.samples.shape[0]
+    least = float(1.0e30)
+    for q in range(s.samples.shape[1]):
+        least = wp.min(least, found.gap[scene, pair, q])
+    share = patches.force[scene, pair] / float(wp.max(patches.nodes[scene, pair], 1))
+    turn = patches.spread[scene, pair] * patches.torque[scene, pair]
+    to_body = wp.transpose(poses.R[scene, i])
+    for q in range(s.samples.shape[1]):
+        if found.gap[scene, pair, q] < least + PATCH:
+            x = _place(s, poses, scene, a, q)
+            F = weight * (share + wp.cross(turn, x - patches.centre[scene, pair]))
+            row = s.near[a, q]
+            if i != a:
+                row = nearest_keypoint(s, i, to_body * (x - poses.com[scene, i]))
+                F = -F
+            mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
+            patches.accelerations[scene, i, row] = patches.accelerations[scene, i, row] + to_body * F / mass
+
+
+@wp.func
+def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int, bodies: int):
+    """Add the impulses of a pair's contacts on body i."""
+    force = wp.vec3d()
+    moment = wp.vec3d()
+    for k in range(c.first[scene, pair], c.first[scene, pair + 1]):
+        J = c.impulse[scene, k]
+        if pair // bodies == i:
+            force += J
+            moment += wp.cross(c.arm_a[scene, k], J)
+        else:
+            force -= J
+            moment -= wp.cross(c.arm_b[scene, k], J)
+    patches.load[scene, i] = patches.load[scene, i] + _single(force)
+    patches.moment[scene, i] = patches.moment[scene, i] + _single(moment)
+
+
+@wp.kernel(enable_backward=False)
+def _frames(
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias, v: Velocities,
+    free: Velocities, c: Contacts, memory: SolverMemory, patches: Patches, substeps: int, h: float, lanes: int,
+):  # fmt: skip
+    scene = wp.tid() // lanes
+    lane = wp.tid() % lanes
+    count = s.samples.shape[0]
+    pairs = count * count
+    room = c.target.shape[1]
+    for _ in range(substeps):
+        for i in range(lane, count, lanes):
+            _begin(bodies, s, m, poses, inertia, v, free, scene, i, h)
+        wait_for_group()
+        for p in range(lane, pairs, lanes):
+            search_pair(s, poses, found, scene, p // count, p % count)
+        wait_for_group()
+        if lane == 0:
+            total = int(0)
+            active = int(0)
+            for p in range(pairs):
+                c.first[scene, p] = total
+                total = wp.min(total + found.count[scene, p], room)
+                if total > c.first[scene, p]:
+                    c.active[scene, active] = p
+                    active += 1
+            c.first[scene, pairs] = total
+            c.active_count[scene] = active
+        wait_for_group()
+        for k in range(lane, c.active_count[scene], lanes):
+            p = c.active[scene, k]
+            i = c.first[scene, p]
+            for slot in range(SLOTS):
+                if found.row[scene, p * SLOTS + slot] != NONE and i < c.first[scene, p + 1]:
+                    _add_contact(bodies, s, m, poses, found, inertia, c, scene, p, slot, i, h)
+                    i += 1
+        wait_for_group()
+        if c.first[scene, pairs] > 0:
+            solve(c, inertia, memory, v, free, scene, lane, lanes, count)
+            for k in range(lane, c.active_count[scene], lanes):
+                _sum_patch(s, poses, found, c, patches, scene, c.active[scene, k])
+            wait_for_group()
+            for i in range(lane, count, lanes):
+                for k in range(c.active_count[scene]):
+                    p = c.active[scene, k]
+                    if p // count == i or p % count == i:
+                        _add_load(c, patches, scene, i, p, count)
+                        _spread_over(bodies, s, poses, found, c, patches, scene, i, p, 1.0 / (h * float(substeps)))
+        else:
+            for i in range(lane, count, lanes):
+                v.linear[scene, i] = free.linear[scene, i]
+                v.angular[scene, i] = free.angular[scene, i]
+        for i in range(lane, count, lanes):
+            _end(bodies, m, poses, v, scene, i, h)
+        wait_for_group()
+
+
+class RigidFrames:
+    """The rigid motion of batches of `scenes` scenes whose bodies have these surfaces.
+
+    `surfaces`: the fields of BodySurfaces.
+    """
+
+    def __init__(self, surfaces: dict[str, Tensor], scenes: int, keypoints: int):
+        self.shape = b, o, _ = scenes, len(surfaces["low"]), keypoints
+        self.device = device = device_of(surfaces["depth"])
+        self.surfaces = with_arrays(SurfaceArrays(), surfaces)
+        contacts, samples = CONTACTS_PER_BODY * o, surfaces["samples"].shape[1]
+        self.group = 1 if device == "cpu" else GROUP
+        self.motion = empty_arrays(BodyMotion, device, (b, o))
+        self.poses = empty_arrays(BodyPoses, device, (b, o), low=None, high=None, pinned=None)
+        self.found = empty_arrays(
+            Found, device, (b, o * o), score=(b, o * o * SLOTS), row=(b, o * o * SLOTS), gap=(b, o * o, samples)
+        )
+        self.inertia = empty_arrays(Inertias, device, (b, o), mass=None, pinned=None)
+        self.velocities, self.free = (empty_arrays(Velocities, device, (b, o)) for _ in range(2))
+        self.contacts, self.memory = solver_arrays(device, b, o, contacts, self.group)
+        self.patches = empty_arrays(Patches, device, (b, o * o), accelerations=None, load=None, moment=None)
+
+    def advance(
+        self, bodies: dict[str, Tensor], box: Float[Tensor, "b o 2 3"], pinned: Bool[Tensor, "b o"],
+        state: tuple[Tensor, Tensor, Tensor, Tensor], substeps: int, h: float,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Float[Tensor, "b o n 3"], Float[Tensor, "b o 6"]]:  # fmt: skip
+        """The state after `substeps` of h [s], the mean accelerations of the keypoints by contact [m/s^2], and the
+        mean force [N] of contacts on each body with its torque about the centre of mass [N m].
+
+        state: com (b, o, 3), quat (b, o, 4), velocity (b, o, 3) and angular momentum per unit of mass (b, o, 3).
+        bodies: the fields of BodyProperties. Accelerations are in the bodies' frames.
+        """
+        names = "com", "quat", "velocity", "momentum"
+        new = {k: x.clone(memory_format=torch.contiguous_format) for k, x in zip(names, state, strict=True)}
+        accelerations = new["com"].new_zeros(*self.shape, 3)
+        load = new["com"].new_zeros(2, *self.shape[:2], 3)
+        with_arrays(self.motion, new)
+        with_arrays(self.poses, {"com": new["com"], "low": box[:, :, 0], "high": box[:, :, 1], "pinned": pinned})
+        with_arrays(self.inertia, {"mass": bodies["mass"], "pinned": pinned})
+        with_arrays(self.patches, {"accelerations": accelerations, "load": load[0], "moment": load[1]})
+        launch(
+            _frames, self.shape[0] * self.group,
+            [with_arrays(BodyProperties(), bodies), self.surfaces, self.motion, self.poses, self.found, self.inertia,
+             self.velocities, self.free, self.contacts, self.memory, self.patches, substeps, h, self.group],
+            device=self.device, block_dim=self.group,
+        )  # fmt: skip
+        return *new.values(), accelerations, torch.cat([*load], -1) / (substeps * h)

@@ -14,7 +14,7 @@ SOLVED = PhysicsBenchOptions(contact="solved")
 
 
 @pytest.mark.parametrize("name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3"])
-def test_agrees_with_theory_where_learned_contact_does_not(name):
+def test_agrees_with_theory_where_learned_contact_does_not(device, name):
     experiment = experiments()[name]
     assert experiment.passes("ngff", measure(experiment, "ngff", SOLVED)["value"])
 
@@ -24,8 +24,8 @@ def test_agrees_with_theory_where_learned_contact_does_not(name):
     "slide/friction=0.1", "slide/soft friction=0.3", "slope/40deg friction=0.3", "tower/3 for 2s", "roll/25deg",
     "rebound/box loss=0.15", "boxes/0.06m 540kg/m3 1e+07Pa",
 ])  # fmt: skip
-def test_agrees_with_theory(name):
-    test_agrees_with_theory_where_learned_contact_does_not(name)
+def test_agrees_with_theory(device, name):
+    test_agrees_with_theory_where_learned_contact_does_not(device, name)
 
 
 def test_is_an_option_of_the_learned_field():

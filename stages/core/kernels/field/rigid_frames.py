@@ -16,8 +16,8 @@ from stages.core.kernels.field.contact_search import (
     MARGIN,
     NONE,
     SLOTS,
-    Found,
     BodyPoses,
+    Found,
     SurfaceArrays,
     contact_in_slot,
     nearest_keypoint,
@@ -121,8 +121,8 @@ def _drifted(m: BodyMotion, bodies: BodyProperties, scene: int, i: int, h: float
 
 @wp.func
 def _begin(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, inertia: Inertias, v: Velocities, free: Velocities,
-    scene: int, i: int, h: float,
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, inertia: Inertias, v: Velocities,
+    free: Velocities, scene: int, i: int, h: float,
 ):  # fmt: skip
     """The first half of a substep for body i, and its velocities without contact."""
     _drifted(m, bodies, scene, i, h / 2.0)
@@ -148,8 +148,8 @@ def _begin(
 
 @wp.func
 def _add_contact(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias, c: Contacts,
-    scene: int, pair: int, slot: int, i: int, h: float,
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias,
+    c: Contacts, scene: int, pair: int, slot: int, i: int, h: float,
 ):  # fmt: skip
     """Write the contact of a slot as contact i."""
     a = pair // s.samples.shape[0]
@@ -243,8 +243,8 @@ def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, pa
 
 @wp.func
 def _spread_over(
-    bodies: BodyProperties, s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches, scene: int, i: int,
-    pair: int, weight: float,
+    bodies: BodyProperties, s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches,
+    scene: int, i: int, pair: int, weight: float,
 ):  # fmt: skip
     """Add the accelerations of body i's keypoints by the contacts of a pair, times `weight`.
 
@@ -288,8 +288,9 @@ def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int, bodi
 
 @wp.kernel(enable_backward=False)
 def _frames(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias, v: Velocities,
-    free: Velocities, c: Contacts, memory: SolverMemory, patches: Patches, substeps: int, h: float, lanes: int,
+    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias,
+    v: Velocities, free: Velocities, c: Contacts, memory: SolverMemory, patches: Patches, substeps: int, h: float,
+    lanes: int,
 ):  # fmt: skip
     scene = wp.tid() // lanes
     lane = wp.tid() % lanes

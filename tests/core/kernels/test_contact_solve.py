@@ -44,7 +44,8 @@ def solve(
 
     both = response(contacts.a, contacts.arm_a) + ~contacts.fixed * response(contacts.b, contacts.arm_b)
     own = {
-        "normal": contacts.normal, "arm_a": contacts.arm_a, "arm_b": contacts.arm_b, "target": contacts.target,
+        "a": contacts.a, "b": torch.where(contacts.fixed, contacts.a, contacts.b), "normal": contacts.normal,
+        "arm_a": contacts.arm_a, "arm_b": contacts.arm_b, "target": contacts.target,
         "friction": contacts.friction, "R_n": 1e-3 * both, "R_t": 1e-3 * both,
         "impulse": torch.zeros_like(contacts.normal),
     }  # fmt: skip

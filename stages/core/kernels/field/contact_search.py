@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from stages.core.kernels.field.groups import wait_for_group
+
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
 EXTREMES = wp.constant(9)  # kept of each: in eight directions, and the deepest
 SLOTS = wp.constant(6 * 9)
@@ -59,12 +61,17 @@ class BodyPoses:
 
 @wp.struct
 class Found:
-    """What was found for each pair of bodies; the pair of a body with itself stands for the planes around it."""
+    """What was found for each pair of bodies a and b; that of a body with itself is for the planes around it."""
 
+    possible: wp.array2d[wp.bool]  # whether both are near each other
+    side: wp.array3d[wp.int8]  # of the normal at each sample; NONE where it is not near
+    gap: wp.array3d[float]  # of each sample [m]
+    other: wp.array3d[int]  # keypoint of b near each sample
+    near: wp.array3d[int]  # samples that are near, one after the other
+    near_count: wp.array2d[int]
     score: wp.array2d[float]  # of each slot
     row: wp.array2d[int]  # sample in each slot
-    gap: wp.array3d[float]  # of the samples of each pair
-    count: wp.array2d[int]  # contacts of each pair
+    count: wp.array2d[int]  # contacts
 
 
 @wp.struct
@@ -74,8 +81,6 @@ class NearPoint:
     at: wp.vec3  # of a [m]
     gap: float  # [m]
     normal: wp.vec3  # of b, towards a
-    keypoint: int  # of a
-    other: int  # of b, near it
     facing: bool  # whether both surfaces face each other
 
 
@@ -176,8 +181,6 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
     out.facing = -wp.dot(own, out.normal) > MIN_FACING
     if s.flat[a, q]:  # under an edge of b, whose own normal is oblique
         out.normal = -own
-    out.keypoint = s.near[a, q]
-    out.other = NONE
     return out
 
 
@@ -197,7 +200,6 @@ def ball_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) ->
             out.normal = -(poses.R[scene, b] * wp.vec3(found[0], found[1], found[2]))
             out.at = centre - s.radius[a] * out.normal
     out.gap += s.overlap[a, b]
-    out.keypoint = nearest_keypoint(s, a, _local(poses, scene, a, out.at))
     out.facing = True
     return out
 
@@ -209,12 +211,9 @@ def plane_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, side: int
     out.normal = _inward(side)
     if s.radius[a] > 0.0:
         out.at = poses.com[scene, a] + poses.R[scene, a] * s.centre[a] - s.radius[a] * out.normal
-        out.keypoint = nearest_keypoint(s, a, _local(poses, scene, a, out.at))
     else:
         out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
-        out.keypoint = s.near[a, q]
     out.gap = _plane_gap(poses, scene, a, side, out.at)
-    out.other = NONE
     out.facing = True
     return out
 
@@ -230,111 +229,154 @@ def _side_of(normal: wp.vec3) -> int:
 
 
 @wp.func
-def _offer(found: Found, scene: int, pair: int, side: int, q: int, near: NearPoint, com: wp.vec3):
-    """Keep a sample where it is the best in one of the directions."""
-    arm = near.at - com
-    u = arm[(side + 1) % 3]
-    v = arm[(side + 2) % 3]
-    lost = GAP_WEIGHT * wp.max(near.gap, 0.0)
-    first = pair * SLOTS + side * EXTREMES
-    for k in range(EXTREMES):
-        value = -near.gap
-        if k < EXTREMES - 1:
-            if k // 4 == 0:  # diagonals
-                value = DIAGONAL * (wp.where(k < 2, u, -u) + wp.where(k % 2 == 0, v, -v)) - lost
-            elif k < 6:
-                value = wp.where(k == 4, u, -u) - lost
-            else:
-                value = wp.where(k == 6, v, -v) - lost
-        if value > found.score[scene, first + k]:
-            found.score[scene, first + k] = value
-            found.row[scene, first + k] = q
+def _possible(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) -> bool:
+    """Whether contacts of body a with b, or with the planes if b = a, are to be looked for."""
+    if poses.pinned[scene, a] and (a == b or poses.pinned[scene, b]):
+        return False
+    if a != b and s.radius[b] > 0.0 and (s.radius[a] == 0.0 or b < a):
+        return False  # it is a contact of b with a
+    com = poses.com[scene, a]
+    if a != b:
+        reach = s.reach[a] + s.reach[b] + poses.margin[scene, a] + poses.margin[scene, b]
+        return wp.length(com - poses.com[scene, b]) < reach
+    out = bool(False)
+    for side in range(SIDES):
+        out = out or _plane_gap(poses, scene, a, side, com) < s.reach[a] + poses.margin[scene, a]
+    return out
 
 
 @wp.func
-def _distinct(found: Found, scene: int, pair: int) -> int:
-    """Empty slots whose sample is in an earlier one of the same side; the number of the others."""
+def _margin(poses: BodyPoses, scene: int, a: int, b: int) -> float:
+    return poses.margin[scene, a] + wp.where(a == b, 0.0, poses.margin[scene, b])
+
+
+@wp.func
+def _look_at(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, q: int):
+    """Sample q of a pair: its gap and the side of its normal, if it is near."""
+    a = pair // s.near.shape[0]
+    b = pair % s.near.shape[0]
+    found.side[scene, pair, q] = wp.int8(NONE)
+    if s.near[a, q] == NONE:
+        return
+    margin = _margin(poses, scene, a, b)
+    at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+    if a == b:
+        least = margin  # of a sample near several planes the nearest one counts
+        for side in range(SIDES):
+            gap = _plane_gap(poses, scene, a, side, at)
+            if gap < least:
+                least = gap
+                found.gap[scene, pair, q] = gap
+                found.side[scene, pair, q] = wp.int8(side)
+        return
+    x = _local(poses, scene, b, at)
+    if _beyond_grid(s, b, x) < margin:
+        point = sample_near(s, poses, scene, a, b, q)
+        if point.gap < margin and point.facing:
+            found.gap[scene, pair, q] = point.gap
+            found.side[scene, pair, q] = wp.int8(_side_of(point.normal))
+            found.other[scene, pair, q] = nearest_keypoint(s, b, x)
+
+
+@wp.func
+def _list_near(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int):
+    count = int(0)
+    for q in range(s.near.shape[1]):
+        if found.side[scene, pair, q] != wp.int8(NONE):
+            found.near[scene, pair, count] = q
+            count += 1
+    found.near_count[scene, pair] = count
+
+
+@wp.func
+def _keep_extremes(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, k: int):
+    """Fill the slots of the k-th direction on all sides."""
+    a = pair // s.near.shape[0]
+    for side in range(SIDES):
+        found.row[scene, pair * SLOTS + side * EXTREMES + k] = NONE
+    for i in range(found.near_count[scene, pair]):
+        q = found.near[scene, pair, i]
+        side = int(found.side[scene, pair, q])
+        gap = found.gap[scene, pair, q]
+        value = -gap
+        if k < EXTREMES - 1:
+            arm = poses.R[scene, a] * s.samples[a, q]
+            u = arm[(side + 1) % 3]
+            v = arm[(side + 2) % 3]
+            if k < 4:  # diagonals
+                value = DIAGONAL * (wp.where(k < 2, u, -u) + wp.where(k % 2 == 0, v, -v))
+            elif k < 6:
+                value = wp.where(k == 4, u, -u)
+            else:
+                value = wp.where(k == 6, v, -v)
+            value -= GAP_WEIGHT * wp.max(gap, 0.0)
+        slot = pair * SLOTS + side * EXTREMES + k
+        if found.row[scene, slot] == NONE or value > found.score[scene, slot]:
+            found.score[scene, slot] = value
+            found.row[scene, slot] = q
+
+
+@wp.func
+def _count_contacts(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int):
+    """Empty slots whose sample is in an earlier one of the same side, and count the others; a ball has one contact."""
+    a = pair // s.near.shape[0]
+    b = pair % s.near.shape[0]
     count = int(0)
     for slot in range(SLOTS):
         at = pair * SLOTS + slot
+        if s.radius[a] > 0.0:
+            touches = bool(False)
+            if a == b and slot % EXTREMES == 0:
+                touches = plane_near(s, poses, scene, a, slot // EXTREMES, 0).gap < poses.margin[scene, a]
+            elif slot == 0:
+                touches = ball_near(s, poses, scene, a, b).gap < _margin(poses, scene, a, b)
+            found.row[scene, at] = wp.where(touches, 0, NONE)
         for other in range(slot - slot % EXTREMES, slot):
             if found.row[scene, pair * SLOTS + other] == found.row[scene, at]:
                 found.row[scene, at] = NONE
         if found.row[scene, at] != NONE:
             count += 1
-    return count
-
-
-@wp.func
-def search_pair(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, a: int, b: int):
-    """Find the contacts of bodies a with b, or with the planes if b = a; sets slots, gaps and the count."""
-    bodies = s.samples.shape[0]
-    samples = s.samples.shape[1]
-    pair = a * bodies + b
-    found.count[scene, pair] = 0
-    if poses.pinned[scene, a] and (a == b or poses.pinned[scene, b]):
-        return
-    com = poses.com[scene, a]
-    margin = poses.margin[scene, a]
-    near = bool(False)
-    if a == b:
-        for side in range(SIDES):
-            near = near or _plane_gap(poses, scene, a, side, com) < s.reach[a] + margin
-    else:
-        margin += poses.margin[scene, b]
-        near = wp.length(com - poses.com[scene, b]) < s.reach[a] + s.reach[b] + margin
-    round_ = s.radius[a] > 0.0
-    if a != b and s.radius[b] > 0.0:  # b's contact is that with a
-        near = near and round_ and a < b
-    if not near:
-        return
-    for slot in range(SLOTS):
-        found.row[scene, pair * SLOTS + slot] = NONE
-        found.score[scene, pair * SLOTS + slot] = -1.0e30
-    for q in range(samples):
-        found.gap[scene, pair, q] = 1.0e30
-        if s.near[a, q] != NONE:
-            if a == b:
-                for side in range(SIDES):
-                    gap = _plane_gap(poses, scene, a, side, com + poses.R[scene, a] * s.samples[a, q])
-                    if gap < margin:
-                        found.gap[scene, pair, q] = wp.min(gap, found.gap[scene, pair, q])
-                        if not round_:
-                            _offer(found, scene, pair, side, q, plane_near(s, poses, scene, a, side, q), com)
-            elif _beyond_grid(s, b, _local(poses, scene, b, com + poses.R[scene, a] * s.samples[a, q])) < margin:
-                point = sample_near(s, poses, scene, a, b, q)
-                if point.gap < margin and point.facing:
-                    found.gap[scene, pair, q] = point.gap
-                    if not round_:
-                        _offer(found, scene, pair, _side_of(point.normal), q, point, com)
-    if not round_:
-        found.count[scene, pair] = _distinct(found, scene, pair)
-        return
-    count = int(0)  # a ball has one contact with a body or plane
-    if a == b:
-        for side in range(SIDES):
-            if plane_near(s, poses, scene, a, side, 0).gap < margin:
-                found.row[scene, pair * SLOTS + side * EXTREMES] = 0
-                count += 1
-    elif ball_near(s, poses, scene, a, b).gap < margin:
-        found.row[scene, pair * SLOTS] = 0
-        count += 1
     found.count[scene, pair] = count
 
 
 @wp.func
+def search(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, lane: int, lanes: int):
+    """Find the contacts of all pairs: their slots and number, and the samples that are near."""
+    bodies = s.near.shape[0]
+    samples = s.near.shape[1]
+    pairs = bodies * bodies
+    for pair in range(lane, pairs, lanes):
+        found.possible[scene, pair] = _possible(s, poses, scene, pair // bodies, pair % bodies)
+        found.count[scene, pair] = 0
+    wait_for_group()
+    for pair in range(pairs):
+        if found.possible[scene, pair]:
+            for q in range(lane, samples, lanes):
+                _look_at(s, poses, found, scene, pair, q)
+    wait_for_group()
+    for pair in range(lane, pairs, lanes):
+        if found.possible[scene, pair]:
+            _list_near(s, poses, found, scene, pair)
+    wait_for_group()
+    for row in range(lane, pairs * EXTREMES, lanes):
+        pair = row // EXTREMES
+        if found.possible[scene, pair] and s.radius[pair // bodies] == 0.0:
+            _keep_extremes(s, poses, found, scene, pair, row % EXTREMES)
+    wait_for_group()
+    for pair in range(lane, pairs, lanes):
+        if found.possible[scene, pair]:
+            _count_contacts(s, poses, found, scene, pair)
+    wait_for_group()
+
+
+@wp.func
 def contact_in_slot(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, slot: int) -> NearPoint:
-    """The contact that `search_pair` has put there."""
-    a = pair // s.samples.shape[0]
-    b = pair % s.samples.shape[0]
+    """The contact that `search` has put there."""
+    a = pair // s.near.shape[0]
+    b = pair % s.near.shape[0]
     q = found.row[scene, pair * SLOTS + slot]
-    out = NearPoint()
     if a == b:
-        out = plane_near(s, poses, scene, a, slot // EXTREMES, q)
-    elif s.radius[a] > 0.0:
-        out = ball_near(s, poses, scene, a, b)
-    else:
-        out = sample_near(s, poses, scene, a, b, q)
-    if a != b:
-        out.other = nearest_keypoint(s, b, _local(poses, scene, b, out.at))
-    return out
+        return plane_near(s, poses, scene, a, slot // EXTREMES, q)
+    if s.radius[a] > 0.0:
+        return ball_near(s, poses, scene, a, b)
+    return sample_near(s, poses, scene, a, b, q)

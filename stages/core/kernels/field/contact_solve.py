@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from stages.core.kernels.field.groups import wait_for_group
 from stages.core.kernels.interop import empty_arrays
 from stages.core.kernels.splat.simd import by_device
 
@@ -82,6 +83,8 @@ class Contacts:
     first: wp.array2d[int]  # contact of each pair a * bodies + b; one more for the end
     active: wp.array2d[int]  # pairs with contacts
     active_count: wp.array[int]
+    a: wp.array2d[int]
+    b: wp.array2d[int]
     normal: wp.array2d[wp.vec3d]  # from b to a
     arm_a: wp.array2d[wp.vec3d]  # from the centres of mass [m]
     arm_b: wp.array2d[wp.vec3d]
@@ -99,8 +102,10 @@ class SolverMemory:
     bound: wp.array2d[f64]  # of the friction of each contact
     relative: wp.array2d[wp.vec3d]  # velocity of a relative to b at each contact
     along: wp.array2d[wp.vec3d]  # its change by a whole step
-    matrices: wp.array3d[wp.mat33d]  # sums over the contacts of each pair, see `_sum_pair`
+    matrices: wp.array3d[wp.mat33d]  # of each contact, see `_evaluate`
     vectors: wp.array3d[wp.vec3d]
+    pair_matrices: wp.array3d[wp.mat33d]  # their sums over the contacts of each pair
+    pair_vectors: wp.array3d[wp.vec3d]
     step: Velocities
     before: Velocities
     H: wp.array2d[f64]  # lower triangle of the Hessian, and below it the negative gradient
@@ -117,7 +122,8 @@ def solver_arrays(device: str, scenes: int, bodies: int, contacts: int, group: i
     b, pairs, n = scenes, bodies * bodies, 6 * bodies
     found = empty_arrays(Contacts, device, (b, contacts), first=(b, pairs + 1), active=(b, pairs), active_count=(b,))
     memory = empty_arrays(
-        SolverMemory, device, (b, contacts), matrices=(b, pairs, 6), vectors=(b, pairs, 3), step=None, before=None,
+        SolverMemory, device, (b, contacts), matrices=(b, contacts, 6), vectors=(b, contacts, 3),
+        pair_matrices=(b, pairs, 6), pair_vectors=(b, pairs, 3), step=None, before=None,
         H=(b, n * (n + 1)), inverse=(b, n), order=(b, bodies), rank=(b, bodies), first_rank=(b, bodies),
         last_rank=(b, bodies), partial=(b, group),
     )  # fmt: skip
@@ -125,28 +131,25 @@ def solver_arrays(device: str, scenes: int, bodies: int, contacts: int, group: i
     return found, memory
 
 
-@wp.func_native(by_device("__syncthreads();", ""))
-def wait_for_group(): ...
-
-
 @wp.func
-def _total(memory: SolverMemory, scene: int, lane: int, lanes: int, value: f64) -> f64:
-    """The sum of the threads' values, for all of them."""
+def _total(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
+    """The sum of the values of the first `used` threads, for all of them."""
     memory.partial[scene, lane] = value
     wait_for_group()
     out = f64(0.0)
-    for i in range(lanes):
+    for i in range(used):
         out += memory.partial[scene, i]
     wait_for_group()
     return out
 
 
 @wp.func
-def _largest(memory: SolverMemory, scene: int, lane: int, lanes: int, value: f64) -> f64:
+def _largest(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
+    """The largest of the values of the first `used` threads."""
     memory.partial[scene, lane] = value
     wait_for_group()
     out = f64(0.0)
-    for i in range(lanes):
+    for i in range(used):
         out = wp.max(out, memory.partial[scene, i])
     wait_for_group()
     return out
@@ -163,8 +166,10 @@ def effective_response(inertia: Inertias, scene: int, body: int, arm: wp.vec3d) 
 
 
 @wp.func
-def _relative(c: Contacts, v: Velocities, scene: int, a: int, b: int, i: int) -> wp.vec3d:
+def _relative(c: Contacts, v: Velocities, scene: int, i: int) -> wp.vec3d:
     """Velocity of a relative to b at a contact."""
+    a = c.a[scene, i]
+    b = c.b[scene, i]
     out = v.linear[scene, a] + wp.cross(v.angular[scene, a], c.arm_a[scene, i])
     if b != a:
         out -= v.linear[scene, b] + wp.cross(v.angular[scene, b], c.arm_b[scene, i])
@@ -202,46 +207,40 @@ def _hessian(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: f64) ->
 
 
 @wp.func
-def _sum_pair(c: Contacts, memory: SolverMemory, v: Velocities, scene: int, a: int, b: int, bodies: int):
-    """Sums over the contacts of a pair, with G their Hessians, J their impulses and K the cross products with the arms:
+def _evaluate(c: Contacts, memory: SolverMemory, v: Velocities, scene: int, i: int):
+    """The terms of a contact, with G its Hessian, J its impulse and K the cross products with its arms:
     G, K_a G, K_b G, K_a G K_a', K_a G K_b', K_b G K_b', and J, K_a J, K_b J.
     """
-    pair = a * bodies + b
-    G = wp.mat33d()
-    aG = wp.mat33d()
-    bG = wp.mat33d()
-    aGa = wp.mat33d()
-    aGb = wp.mat33d()
-    bGb = wp.mat33d()
-    J = wp.vec3d()
-    aJ = wp.vec3d()
-    bJ = wp.vec3d()
-    for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
-        relative = _relative(c, v, scene, a, b, i)
-        memory.relative[scene, i] = relative
-        own = _hessian(c, scene, i, relative, memory.bound[scene, i])
-        impulse = _impulse(c, scene, i, relative, memory.bound[scene, i])
-        K_a = wp.skew(c.arm_a[scene, i])
-        G += own
-        aG += K_a * own
-        aGa += K_a * own * wp.transpose(K_a)
-        J += impulse
-        aJ += K_a * impulse
-        if a != b:
-            K_b = wp.skew(c.arm_b[scene, i])
-            bG += K_b * own
-            aGb += K_a * own * wp.transpose(K_b)
-            bGb += K_b * own * wp.transpose(K_b)
-            bJ += K_b * impulse
-    memory.matrices[scene, pair, 0] = G
-    memory.matrices[scene, pair, 1] = aG
-    memory.matrices[scene, pair, 2] = bG
-    memory.matrices[scene, pair, 3] = aGa
-    memory.matrices[scene, pair, 4] = aGb
-    memory.matrices[scene, pair, 5] = bGb
-    memory.vectors[scene, pair, 0] = J
-    memory.vectors[scene, pair, 1] = aJ
-    memory.vectors[scene, pair, 2] = bJ
+    relative = _relative(c, v, scene, i)
+    G = _hessian(c, scene, i, relative, memory.bound[scene, i])
+    J = _impulse(c, scene, i, relative, memory.bound[scene, i])
+    K_a = wp.skew(c.arm_a[scene, i])
+    K_b = wp.skew(c.arm_b[scene, i])
+    memory.relative[scene, i] = relative
+    memory.matrices[scene, i, 0] = G
+    memory.matrices[scene, i, 1] = K_a * G
+    memory.matrices[scene, i, 2] = K_b * G
+    memory.matrices[scene, i, 3] = K_a * G * wp.transpose(K_a)
+    memory.matrices[scene, i, 4] = K_a * G * wp.transpose(K_b)
+    memory.matrices[scene, i, 5] = K_b * G * wp.transpose(K_b)
+    memory.vectors[scene, i, 0] = J
+    memory.vectors[scene, i, 1] = K_a * J
+    memory.vectors[scene, i, 2] = K_b * J
+
+
+@wp.func
+def _sum_pair(c: Contacts, memory: SolverMemory, scene: int, pair: int, term: int):
+    """The sum of one of the matrices, or of the vectors after them, over the contacts of a pair."""
+    if term < 6:
+        matrix = wp.mat33d()
+        for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
+            matrix += memory.matrices[scene, i, term]
+        memory.pair_matrices[scene, pair, term] = matrix
+    else:
+        vector = wp.vec3d()
+        for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
+            vector += memory.vectors[scene, i, term - 6]
+        memory.pair_vectors[scene, pair, term - 6] = vector
 
 
 @wp.func
@@ -286,18 +285,18 @@ def _assemble_own(
         for other in range(bodies):
             pair = i * bodies + other
             if _has_contacts(c, scene, pair):
-                top += memory.matrices[scene, pair, 0]
-                left += memory.matrices[scene, pair, 1]
-                bottom += memory.matrices[scene, pair, 3]
-                force += memory.vectors[scene, pair, 0]
-                torque += memory.vectors[scene, pair, 1]
+                top += memory.pair_matrices[scene, pair, 0]
+                left += memory.pair_matrices[scene, pair, 1]
+                bottom += memory.pair_matrices[scene, pair, 3]
+                force += memory.pair_vectors[scene, pair, 0]
+                torque += memory.pair_vectors[scene, pair, 1]
             pair = other * bodies + i
             if other != i and _has_contacts(c, scene, pair):
-                top += memory.matrices[scene, pair, 0]
-                left += memory.matrices[scene, pair, 2]
-                bottom += memory.matrices[scene, pair, 5]
-                force -= memory.vectors[scene, pair, 0]
-                torque -= memory.vectors[scene, pair, 2]
+                top += memory.pair_matrices[scene, pair, 0]
+                left += memory.pair_matrices[scene, pair, 2]
+                bottom += memory.pair_matrices[scene, pair, 5]
+                force -= memory.pair_vectors[scene, pair, 0]
+                torque -= memory.pair_vectors[scene, pair, 2]
     row = memory.rank[scene, i]
     _write_block(memory, scene, row, row, bodies, top, wp.transpose(left), left, bottom)
     for k in range(3):
@@ -315,16 +314,16 @@ def _assemble_pair(c: Contacts, inertia: Inertias, memory: SolverMemory, scene: 
     if not (inertia.pinned[scene, i] or inertia.pinned[scene, j]):
         pair = i * bodies + j
         if _has_contacts(c, scene, pair):
-            top -= memory.matrices[scene, pair, 0]
-            right -= wp.transpose(memory.matrices[scene, pair, 2])
-            left -= memory.matrices[scene, pair, 1]
-            bottom -= memory.matrices[scene, pair, 4]
+            top -= memory.pair_matrices[scene, pair, 0]
+            right -= wp.transpose(memory.pair_matrices[scene, pair, 2])
+            left -= memory.pair_matrices[scene, pair, 1]
+            bottom -= memory.pair_matrices[scene, pair, 4]
         pair = j * bodies + i
         if _has_contacts(c, scene, pair):
-            top -= memory.matrices[scene, pair, 0]
-            right -= wp.transpose(memory.matrices[scene, pair, 1])
-            left -= memory.matrices[scene, pair, 2]
-            bottom -= wp.transpose(memory.matrices[scene, pair, 4])
+            top -= memory.pair_matrices[scene, pair, 0]
+            right -= wp.transpose(memory.pair_matrices[scene, pair, 1])
+            left -= memory.pair_matrices[scene, pair, 2]
+            bottom -= wp.transpose(memory.pair_matrices[scene, pair, 4])
     _write_block(memory, scene, memory.rank[scene, i], memory.rank[scene, j], bodies, top, right, left, bottom)
 
 
@@ -389,7 +388,7 @@ def _slope(
         along = memory.along[scene, i]
         impulse = _impulse(c, scene, i, memory.relative[scene, i] + size * along, memory.bound[scene, i])
         s -= wp.dot(impulse, along)
-    return inertial + _total(memory, scene, lane, lanes, s)
+    return inertial + _total(memory, scene, lane, wp.min(lanes, count), s)
 
 
 @wp.func
@@ -399,10 +398,8 @@ def _step_size(
 ) -> f64:  # fmt: skip
     """Where the derivative along the step vanishes, at most 1."""
     count = c.first[scene, bodies * bodies]
-    for k in range(lane, c.active_count[scene], lanes):
-        p = c.active[scene, k]
-        for i in range(c.first[scene, p], c.first[scene, p + 1]):
-            memory.along[scene, i] = _relative(c, memory.step, scene, p // bodies, p % bodies, i)
+    for i in range(lane, count, lanes):
+        memory.along[scene, i] = _relative(c, memory.step, scene, i)
     at_zero = f64(0.0)
     gain = f64(0.0)
     for i in range(lane, bodies, lanes):
@@ -414,8 +411,8 @@ def _step_size(
             at_zero += mass * wp.dot(v.linear[scene, i] - free.linear[scene, i], linear)
             at_zero += wp.dot(v.angular[scene, i] - free.angular[scene, i], pushed)
             gain += mass * wp.dot(linear, linear) + wp.dot(angular, pushed)
-    at_zero = _total(memory, scene, lane, lanes, at_zero)
-    gain = _total(memory, scene, lane, lanes, gain)
+    at_zero = _total(memory, scene, lane, wp.min(lanes, bodies), at_zero)
+    gain = _total(memory, scene, lane, wp.min(lanes, bodies), gain)
     low = f64(0.0)
     slope_low = _slope(c, memory, scene, lane, lanes, count, low, at_zero)
     high = f64(1.0)
@@ -451,9 +448,11 @@ def _newton_step(
     lanes: int, bodies: int,
 ) -> f64:  # fmt: skip
     """Change the velocities by a step of Newton's method; the largest change."""
-    for k in range(lane, c.active_count[scene], lanes):
-        p = c.active[scene, k]
-        _sum_pair(c, memory, v, scene, p // bodies, p % bodies, bodies)
+    for i in range(lane, c.first[scene, bodies * bodies], lanes):
+        _evaluate(c, memory, v, scene, i)
+    wait_for_group()
+    for k in range(lane, 9 * c.active_count[scene], lanes):
+        _sum_pair(c, memory, scene, c.active[scene, k // 9], k % 9)
     wait_for_group()
     for i in range(lane, bodies, lanes):
         _assemble_own(c, inertia, memory, v, free, scene, i, bodies)
@@ -472,7 +471,7 @@ def _newton_step(
         v.angular[scene, i] = v.angular[scene, i] + angular
         for k in range(3):
             change = wp.max(change, wp.max(wp.abs(linear[k]), wp.abs(angular[k])))
-    return _largest(memory, scene, lane, lanes, change)
+    return _largest(memory, scene, lane, wp.min(lanes, bodies), change)
 
 
 @wp.func
@@ -528,11 +527,8 @@ def solve(
     wait_for_group()
     for k in range(ROUNDS):  # the first without friction
         if k > 0:
-            for active in range(lane, c.active_count[scene], lanes):
-                p = c.active[scene, active]
-                for i in range(c.first[scene, p], c.first[scene, p + 1]):
-                    relative = _relative(c, v, scene, p // bodies, p % bodies, i)
-                    memory.bound[scene, i] = c.friction[scene, i] * _along(c, scene, i, relative)
+            for i in range(lane, count, lanes):
+                memory.bound[scene, i] = c.friction[scene, i] * _along(c, scene, i, _relative(c, v, scene, i))
         for i in range(lane, bodies, lanes):
             memory.before.linear[scene, i] = v.linear[scene, i]
             memory.before.angular[scene, i] = v.angular[scene, i]
@@ -546,11 +542,8 @@ def solve(
             angular = v.angular[scene, i] - memory.before.angular[scene, i]
             for axis in range(3):
                 change = wp.max(change, wp.max(wp.abs(linear[axis]), wp.abs(angular[axis])))
-        if _largest(memory, scene, lane, lanes, change) < TOLERANCE and k > 0:
+        if _largest(memory, scene, lane, wp.min(lanes, bodies), change) < TOLERANCE and k > 0:
             break
-    for k in range(lane, c.active_count[scene], lanes):
-        p = c.active[scene, k]
-        for i in range(c.first[scene, p], c.first[scene, p + 1]):
-            relative = _relative(c, v, scene, p // bodies, p % bodies, i)
-            c.impulse[scene, i] = _impulse(c, scene, i, relative, memory.bound[scene, i])
+    for i in range(lane, count, lanes):
+        c.impulse[scene, i] = _impulse(c, scene, i, _relative(c, v, scene, i), memory.bound[scene, i])
     wait_for_group()

@@ -20,8 +20,7 @@ from stages.core.kernels.field.contact_search import (
     Found,
     SurfaceArrays,
     contact_in_slot,
-    nearest_keypoint,
-    search_pair,
+    search,
 )
 from stages.core.kernels.field.contact_solve import (
     FRICTION_REGULARISATION,
@@ -33,8 +32,8 @@ from stages.core.kernels.field.contact_solve import (
     effective_response,
     solve,
     solver_arrays,
-    wait_for_group,
 )
+from stages.core.kernels.field.groups import wait_for_group
 from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
 from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays
 
@@ -76,13 +75,14 @@ class BodyMotion:
 
 @wp.struct
 class Patches:
-    """How contacts are spread over keypoints: of each pair, with impulses J at x, W nodes of mean place m."""
+    """How the contacts of each pair are spread over its nodes, the samples that touch: at x each bears
+    share + turn x (x - centre).
+    """
 
-    centre: wp.array2d[wp.vec3]  # m
-    nodes: wp.array2d[int]  # W
-    spread: wp.array2d[wp.mat33]  # inverse of the nodes' second moments
-    force: wp.array2d[wp.vec3]  # sum of J
-    torque: wp.array2d[wp.vec3]  # sum of (x - m) x J
+    limit: wp.array2d[float]  # of the nodes' gaps [m]
+    centre: wp.array2d[wp.vec3]
+    share: wp.array2d[wp.vec3]
+    turn: wp.array2d[wp.vec3]
     accelerations: wp.array3d[wp.vec3]  # of keypoints in the bodies' frames; the result
     load: wp.array2d[wp.vec3]  # sum of all impulses on each body; the result
     moment: wp.array2d[wp.vec3]  # that about its centre of mass
@@ -178,6 +178,8 @@ def _add_contact(
         target = wp.min(-RECOVERY / h * near.gap, MAX_RECOVERY_SPEED)
     if approach < -REBOUND_SPEED and near.gap + h * approach < ROUGHNESS:
         target = wp.max(target, gained - wp.exp(-HALF_PI * loss) * (approach + gained))
+    c.a[scene, i] = a
+    c.b[scene, i] = b
     c.normal[scene, i] = _double(near.normal)
     c.arm_a[scene, i] = _double(arm_a)
     c.arm_b[scene, i] = _double(arm_b)
@@ -207,23 +209,30 @@ def _place(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, q: int) -> wp
 
 
 @wp.func
+def _least_gap(found: Found, scene: int, pair: int) -> float:
+    out = float(1.0e30)
+    for k in range(found.near_count[scene, pair]):
+        out = wp.min(out, found.gap[scene, pair, found.near[scene, pair, k]])
+    return out
+
+
+@wp.func
 def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches, scene: int, pair: int):
     """Force and torque of the contacts of a pair, and the nodes that they are spread over."""
-    a = pair // s.samples.shape[0]
-    least = float(1.0e30)
-    samples = s.samples.shape[1]
-    for q in range(samples):
-        least = wp.min(least, found.gap[scene, pair, q])
+    a = pair // s.near.shape[0]
+    limit = _least_gap(found, scene, pair) + PATCH
     nodes = int(0)
     centre = wp.vec3()
-    for q in range(samples):
-        if found.gap[scene, pair, q] < least + PATCH:
+    for k in range(found.near_count[scene, pair]):
+        q = found.near[scene, pair, k]
+        if found.gap[scene, pair, q] < limit:
             nodes += 1
             centre += _place(s, poses, scene, a, q)
     centre = centre / float(wp.max(nodes, 1))
     moment = wp.mat33()
-    for q in range(samples):
-        if found.gap[scene, pair, q] < least + PATCH:
+    for k in range(found.near_count[scene, pair]):
+        q = found.near[scene, pair, k]
+        if found.gap[scene, pair, q] < limit:
             arm = _place(s, poses, scene, a, q) - centre
             moment += wp.dot(arm, arm) * wp.identity(3, dtype=float) - wp.outer(arm, arm)
     force = wp.vec3()
@@ -232,41 +241,42 @@ def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, pa
         J = _single(c.impulse[scene, i])
         force += J
         torque += wp.cross(_single(c.arm_a[scene, i]) + poses.com[scene, a] - centre, J)
-    trace = wp.trace(moment)
-    patches.nodes[scene, pair] = nodes
+    patches.limit[scene, pair] = limit
     patches.centre[scene, pair] = centre
+    patches.share[scene, pair] = force / float(wp.max(nodes, 1))
     # a multiple of the identity: nodes on a line cannot bear a torque about it
-    patches.spread[scene, pair] = wp.inverse(moment + (1.0e-2 * trace + 1.0e-9) * wp.identity(3, dtype=float))
-    patches.force[scene, pair] = force
-    patches.torque[scene, pair] = torque
+    extra = 1.0e-2 * wp.trace(moment) + 1.0e-9
+    patches.turn[scene, pair] = wp.inverse(moment + extra * wp.identity(3, dtype=float)) * torque
 
 
 @wp.func
 def _spread_over(
     bodies: BodyProperties, s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches,
-    scene: int, i: int, pair: int, weight: float,
+    scene: int, i: int, part: int, parts: int, weight: float,
 ):  # fmt: skip
-    """Add the accelerations of body i's keypoints by the contacts of a pair, times `weight`.
+    """Add the accelerations of a part of body i's keypoints by all contacts, times `weight`.
 
     Forces and torques are divided among the nodes as by interpolation elements (RBE3) of finite-element codes.
     """
-    a = pair // s.samples.shape[0]
-    least = float(1.0e30)
-    for q in range(s.samples.shape[1]):
-        least = wp.min(least, found.gap[scene, pair, q])
-    share = patches.force[scene, pair] / float(wp.max(patches.nodes[scene, pair], 1))
-    turn = patches.spread[scene, pair] * patches.torque[scene, pair]
+    count = s.near.shape[0]
     to_body = wp.transpose(poses.R[scene, i])
-    for q in range(s.samples.shape[1]):
-        if found.gap[scene, pair, q] < least + PATCH:
-            x = _place(s, poses, scene, a, q)
-            F = weight * (share + wp.cross(turn, x - patches.centre[scene, pair]))
-            row = s.near[a, q]
-            if i != a:
-                row = nearest_keypoint(s, i, to_body * (x - poses.com[scene, i]))
-                F = -F
-            mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
-            patches.accelerations[scene, i, row] = patches.accelerations[scene, i, row] + to_body * F / mass
+    for active in range(c.active_count[scene]):
+        pair = c.active[scene, active]
+        a = pair // count
+        if a == i or pair % count == i:
+            for k in range(found.near_count[scene, pair]):
+                q = found.near[scene, pair, k]
+                row = s.near[a, q]
+                if i != a:
+                    row = found.other[scene, pair, q]
+                if row % parts == part and found.gap[scene, pair, q] < patches.limit[scene, pair]:
+                    arm = _place(s, poses, scene, a, q) - patches.centre[scene, pair]
+                    F = weight * (patches.share[scene, pair] + wp.cross(patches.turn[scene, pair], arm))
+                    if i != a:
+                        F = -F
+                    mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
+                    before = patches.accelerations[scene, i, row]
+                    patches.accelerations[scene, i, row] = before + to_body * F / mass
 
 
 @wp.func
@@ -301,9 +311,7 @@ def _frames(
         for i in range(lane, count, lanes):
             _begin(bodies, s, m, poses, inertia, v, free, scene, i, h)
         wait_for_group()
-        for p in range(lane, pairs, lanes):
-            search_pair(s, poses, found, scene, p // count, p % count)
-        wait_for_group()
+        search(s, poses, found, scene, lane, lanes)
         if lane == 0:
             total = int(0)
             active = int(0)
@@ -334,7 +342,10 @@ def _frames(
                     p = c.active[scene, k]
                     if p // count == i or p % count == i:
                         _add_load(c, patches, scene, i, p, count)
-                        _spread_over(bodies, s, poses, found, c, patches, scene, i, p, 1.0 / (h * float(substeps)))
+            parts = wp.max(lanes // count, 1)
+            for k in range(lane, count * parts, lanes):
+                weight = 1.0 / (h * float(substeps))
+                _spread_over(bodies, s, poses, found, c, patches, scene, k // parts, k % parts, parts, weight)
         else:
             for i in range(lane, count, lanes):
                 v.linear[scene, i] = free.linear[scene, i]
@@ -358,8 +369,9 @@ class RigidFrames:
         self.group = 1 if device == "cpu" else GROUP
         self.motion = empty_arrays(BodyMotion, device, (b, o))
         self.poses = empty_arrays(BodyPoses, device, (b, o), low=None, high=None, pinned=None)
+        slots, each = (b, o * o * SLOTS), (b, o * o, samples)
         self.found = empty_arrays(
-            Found, device, (b, o * o), score=(b, o * o * SLOTS), row=(b, o * o * SLOTS), gap=(b, o * o, samples)
+            Found, device, (b, o * o), score=slots, row=slots, side=each, gap=each, other=each, near=each
         )
         self.inertia = empty_arrays(Inertias, device, (b, o), mass=None, pinned=None)
         self.velocities, self.free = (empty_arrays(Velocities, device, (b, o)) for _ in range(2))

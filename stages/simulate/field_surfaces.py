@@ -1,20 +1,25 @@
-"""Surfaces of a scene's objects for the contacts of the learned field, in model units and the frames of its bodies."""
+"""Surfaces of a scene's objects for the contacts of the learned field, in model units and the frames of its bodies.
+
+An object that fills its convex hull has that of its Gaussians as its surface, as for rigid bodies, so that faces are
+flat and edges sharp. Those of others are known to a voxel.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from stages.core.physics.convex_cuts import EXTREMES
-from stages.core.physics.convex_parts import balls
+from stages.core.physics.convex_parts import balls, convex_hulls
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.core.scene.scene import Scene
@@ -32,13 +37,15 @@ def body_surfaces(
     com = centre_of_mass(initial, initial.points)
     grids = []
     arms = torch.where(initial.valid[..., None], initial.points - com[:, :, None], 0.0)[0]
-    found = balls(scene, seed, float(floors.min()))
+    floor = float(floors.min())
+    found, hulls = balls(scene, seed, floor), convex_hulls(scene, seed, floor)
     for row, o in enumerate(scene.objects):
         own = arms[row, initial.valid[0, row]]
         surface = solid_surface(scene, o.id, seed).fitted
         _, first = surface.depth_grid()
         start = units.to_model(lift[row]) - com[0, row]  # of the origin of the scene, in the body's frame
-        grid = _grid(surface, float(floors[row]), own, start, units.length, seed)
+        shape = _Shape(surface, hulls[row], float(floors[row]))
+        grid = _grid(shape, own, start, units.length, seed)
         if (ball := found[row]) is not None:
             centre = start + units.length * torch.from_numpy(ball.centre).float()
             grid = replace(grid, ball=(centre, units.length * ball.radius))
@@ -47,35 +54,67 @@ def body_surfaces(
     return replace(surfaces, overlap=_overlaps(surfaces, com[0]))
 
 
-def _grid(
-    surface: SolidSurface, floor: float, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], length: float, seed: int
-) -> BodyGrid:
+class _Shape:
+    """The surface of an object above a floor, in scene units."""
+
+    def __init__(self, surface: SolidSurface, hull: ConvexHull | None, floor: float):
+        """`hull` of an object that fills it."""
+        self.surface, self.hull, self.floor = surface, hull, floor
+
+    def depth_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """As that of SolidSurface."""
+        depth, first = self.surface.depth_grid()
+        if self.hull is not None:
+            depth = depth.copy()
+            near = np.argwhere(np.abs(depth) < NEAR * self.surface.h)
+            depth[tuple(near.T)] = -self._beyond_faces(first + self.surface.h * near).max(1)
+        height = first[2] + self.surface.h * np.arange(depth.shape[2]) - self.floor
+        return np.minimum(depth, height), first
+
+    def samples(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points (k, 3) and normals (k, 3): the outermost points, and others far from each other."""
+        points, normals = self.surface.samples()
+        if self.hull is not None:
+            beyond, faces = self._beyond_faces(points), self._faces[:, :3]
+            face = beyond.argmax(1)
+            on_faces = points - beyond.max(1, keepdims=True) * faces[face]
+            corners = self.hull.points[self.hull.vertices]
+            nearest = self._beyond_faces(corners) > -self.surface.h
+            mean = nearest.astype(float) @ faces
+            normals = np.concatenate([mean / np.linalg.norm(mean, axis=1, keepdims=True).clip(1e-9), faces[face]])
+            points = np.concatenate([corners, on_faces])
+        if (above := points[:, 2] > self.floor - self.surface.h).any():
+            points, normals = np.maximum(points[above], [-np.inf, -np.inf, self.floor]), normals[above]
+        outer = np.unique((EXTREMES @ points.T).argmax(1))
+        others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
+        chosen = np.union1d(outer, others)
+        return points[chosen], normals[chosen]
+
+    @cached_property
+    def _faces(self) -> np.ndarray:
+        """Normals and offsets (f, 4) of the hull's faces, one for those in a plane."""
+        _, first = np.unique(self.hull.equations.round(5), axis=0, return_index=True)
+        return self.hull.equations[first]
+
+    def _beyond_faces(self, x: np.ndarray) -> np.ndarray:
+        """Distances (k, f) of points (k, 3) from the planes of the hull's faces, negative inside."""
+        return x @ self._faces[:, :3].T + self._faces[:, 3]
+
+
+def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], length: float, seed: int) -> BodyGrid:
     """The grid of a body with keypoints at `arm` [m]; `start` is the origin of the scene in the body's frame [m]."""
-    depth, first = surface.depth_grid()
-    height = first[2] + surface.h * np.arange(depth.shape[2]) - floor
-    depth = np.minimum(depth, height)
-    low, h = start + length * torch.from_numpy(first).float(), length * surface.h
+    depth, first = shape.depth_grid()
+    low, h = start + length * torch.from_numpy(first).float(), length * shape.surface.h
     keypoints = cKDTree(arm.numpy())
-    nodes = np.argwhere(np.abs(depth) < NEAR * surface.h)
+    nodes = np.argwhere(np.abs(depth) < NEAR * shape.surface.h)
     keypoint = np.zeros(depth.shape, np.int64)
     keypoint[tuple(nodes.T)] = keypoints.query(low.numpy() + h * nodes, workers=-1)[1]
     smooth = ndimage.gaussian_filter(depth, 1.0)
     on_grid = (torch.from_numpy(length * x).float() for x in (depth, smooth))
-    samples, normals = _samples(surface, floor, seed)
-    at = start + length * samples
+    points, normals = (torch.from_numpy(x).float() for x in shape.samples(seed))
+    at = start + length * points
     near = torch.from_numpy(keypoints.query(at.numpy(), workers=-1)[1])
     return BodyGrid(*on_grid, torch.from_numpy(keypoint), low, h, at, normals, near)
-
-
-def _samples(surface: SolidSurface, floor: float, seed: int) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-    """Points on a surface above a floor, and normals: the outermost ones, and others far from each other."""
-    points, normals = surface.samples()
-    if (above := points[:, 2] > floor - surface.h).any():
-        points, normals = np.maximum(points[above], [-np.inf, -np.inf, floor]), normals[above]
-    outer = np.unique((EXTREMES @ points.T).argmax(1))
-    others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
-    chosen = np.union1d(outer, others)
-    return torch.from_numpy(points[chosen]).float(), torch.from_numpy(normals[chosen]).float()
 
 
 def _overlaps(surfaces: BodySurfaces, com: Float[Tensor, "o 3"]) -> Float[Tensor, "o o"]:

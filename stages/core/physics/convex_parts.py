@@ -83,6 +83,12 @@ def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | N
 
 
 @cached_in_scene
+def convex_hulls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexHull | None]:
+    """The hulls of the objects that fill them, in the order of scene.objects; arguments as those of `convex_parts`."""
+    return [_filled_hull(solid) for solid in _solids(scene, seed, bottom)]
+
+
+@cached_in_scene
 def _solids(scene: Scene, seed: int, bottom: float) -> list[Solid]:
     return parallel_map(lambda id: _solid(scene, id, seed, bottom), [o.id for o in scene.objects])
 
@@ -116,11 +122,17 @@ def _ball_parts(ball: Ball) -> ConvexParts:
 
 
 def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:
-    whole = _hull(solid.seen)
-    if whole is not None and whole.volume * CONVEX < solid.moments[0]:
+    whole = _filled_hull(solid)
+    if whole is not None:
         return ConvexParts((_vertices(whole, seed),), *_solid_moments(whole))
     hulls = _hulls(solid, divide(solid.voxels / solid.h, others / solid.h))
     return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), *solid.moments)
+
+
+def _filled_hull(solid: Solid) -> ConvexHull | None:
+    """Its convex hull, if it fills that."""
+    hull = _hull(solid.seen)
+    return hull if hull is not None and hull.volume * CONVEX < solid.moments[0] else None
 
 
 def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:

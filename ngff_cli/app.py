@@ -110,7 +110,7 @@ def simulate(
     ] = SimulateOptions.integrator,
     contact: Annotated[
         str,
-        Option(help="engine ngff: learned, or solved by the materials' friction and loss factor (slower)"),
+        Option(help="engine ngff: learned, for soft bodies | solved, with the materials' friction and rebound | auto"),
     ] = SimulateOptions.contact,
     live: Annotated[
         bool,

@@ -317,7 +317,7 @@ def bench_physics(
     quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = "draft",
     keypoints: Keypoints = 256,
     weights: Annotated[Path | None, Option(help="weights of the learned engine; default: those in the package")] = None,
-    contact: Annotated[str, Option(help="contacts of the engine ngff: learned | solved")] = "learned",
+    contact: Annotated[str, Option(help="contacts of the engine ngff: auto | learned | solved")] = "auto",
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:

@@ -1,19 +1,21 @@
-"""The engine of `--engine auto`: by how far weight and impacts deform the objects."""
+"""The engine of `--engine auto` and its contacts: by how far weight and impacts deform the objects."""
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.materials import MODELS, Material, choose_materials
-from stages.core.scene.scene import Scene
+from stages.core.physics.materials import MODELS, Material, MaterialChoice, choose_materials
+from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import AUTO, SimulateOptions
 
 log = logging.getLogger(__name__)
 MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
+MAX_SOLVED_SAG = 0.01  # the same of a body with solved contacts, which are those of its undeformed surface
 MAX_RIGID_IMPACT = 0.1  # largest compression by its own impact; that of which `plausibility.py` warns
 NO_PROMPTS = ForcePrompts()
 
@@ -21,23 +23,40 @@ NO_PROMPTS = ForcePrompts()
 def with_engine(
     options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts = NO_PROMPTS
 ) -> SimulateOptions:
-    """The options with an engine in place of `auto`.
+    """The options with an engine and contacts in place of `auto`.
 
     MPM if an object yields or flows, or has parts of different materials. Rigid bodies if no weight compresses an
     object by more than MAX_RIGID_SAG, nor the speed that the prompts give it by more than MAX_RIGID_IMPACT. Of the two
     engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
     learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
-    Options of learned engines (weights, an integrator, its contacts) select it.
+    Options of learned engines (weights, an integrator, its contacts) select it. Its contacts are solved if no weight
+    compresses an object by more than MAX_SOLVED_SAG, and learned otherwise, with an integrator, since solved ones have
+    no rate of change, or with weights, which may be of a model without these contacts.
     """
-    if options.engine != AUTO:
+    engine = options.engine
+    if engine == AUTO:
+        engine = _engine(options, scene, keypoints, prompts)
+    options = replace(options, engine=engine)
+    if options.contact != AUTO or engine != "ngff":
         return options
-    if options.weights is not None or options.integrator != "step" or options.contact != "learned":
-        return replace(options, engine="ngff")
+    if options.weights is not None or options.integrator != "step":
+        return replace(options, contact="learned")
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    soft = _soft(materials, scene, keypoints, options.gravity, MAX_SOLVED_SAG)
+    if soft:
+        log.info("--contact learned, as object %d is compressed by more than %.0f %% by its own weight",
+                 soft[0].id, 100 * MAX_SOLVED_SAG)  # fmt: skip
+    return replace(options, contact="learned" if soft else "solved")
+
+
+def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts) -> str:
+    """The engine in place of `auto`."""
+    if options.weights is not None or options.integrator != "step" or options.contact != AUTO:
+        return "ngff"
     materials = choose_materials(scene.objects, options.material, options.materials)
     uneven = [o for o in scene.objects if materials[o.id].several]
     plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
-    soft = [o for o in scene.objects if sag(materials[o.id].material, _height(scene, keypoints, o.id), options.gravity)
-            > MAX_RIGID_SAG]  # fmt: skip
+    soft = _soft(materials, scene, keypoints, options.gravity, MAX_RIGID_SAG)
     crushed = [o for o in scene.objects if impact(materials[o.id].material, _speed(scene, o.id, prompts, options))
                > MAX_RIGID_IMPACT]  # fmt: skip
     sideways = _sideways(prompts) if soft or crushed else []
@@ -54,7 +73,15 @@ def with_engine(
     else:
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)
-    return replace(options, engine=engine)
+    return engine
+
+
+def _soft(
+    materials: Mapping[int, MaterialChoice], scene: Scene, keypoints: Keypoints, gravity: float, limit: float
+) -> list[SceneObject]:
+    """The objects that their own weight compresses by more than `limit`."""
+    return [o for o in scene.objects
+            if sag(materials[o.id].material, _height(scene, keypoints, o.id), gravity) > limit]  # fmt: skip
 
 
 def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) -> ForcePrompts:

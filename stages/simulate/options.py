@@ -26,8 +26,8 @@ ENGINES = {
     "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies by MuJoCo, for stiff ones"),
 }
 DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with the latter two CPU cores keep up with real time
+CONTACTS = (AUTO, "learned", "solved")
 # The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).
-CONTACTS = ("learned", "solved")
 INTEGRATORS = ("step", "euler", "rk4", "dopri5")
 ENGINE_HELP = " | ".join(["auto: by the materials of the objects", *(f"{k}: {v.help}" for k, v in ENGINES.items())])
 
@@ -77,7 +77,7 @@ class SimulateOptions:
     keypoints: int | None = None  # maximum number per object; None: see keypoint_count
     weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
     integrator: str = "step"  # of a learned engine, one of INTEGRATORS
-    contact: str = "learned"  # of the engine ngff, one of CONTACTS
+    contact: str = AUTO  # of the engine ngff, one of CONTACTS; AUTO: see engine_choice.py
     live: bool = False  # in real time, with a page in the browser to act on the objects
     browser: bool = True  # whether --live opens it
     port: int = 0  # of --live on 127.0.0.1; 0: any free one
@@ -91,7 +91,7 @@ class SimulateOptions:
             raise InputError(f"--integrator {self.integrator}: only for learned engines, not for {self.engine}")
         if self.contact not in CONTACTS:
             raise InputError(f"--contact {self.contact}: choose from {', '.join(CONTACTS)}")
-        if self.contact != "learned" and self.engine not in (AUTO, "ngff"):
+        if self.contact != AUTO and self.engine not in (AUTO, "ngff"):
             raise InputError(f"--contact {self.contact}: only for --engine ngff, not for {self.engine}")
         if self.quality not in QUALITIES:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")

@@ -28,7 +28,7 @@ from stages.render.stage import run as render
 from stages.simulate.live.messages import BadMessage, parse_message
 from stages.simulate.live.server import MAX_CLIENTS, LiveServer
 from stages.simulate.live.session import Session
-from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.options import AUTO, ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import parse_box
 from stages.simulate.stage import run
 from tests.browser import drag_up, until
@@ -97,7 +97,8 @@ def world():
 def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
     """Keypoints of a session with messages at some frames, the session, and the motion of its prompts."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, step=0.017))
-    options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box=box)
+    contact = "learned" if engine == "ngff" else AUTO
+    options = SimulateOptions(engine=engine, contact=contact, quality="draft", steps=frames, keypoints=32, box=box)
     keypoints = choose_keypoints(world, 32)
     rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)
     walls = parse_box(box)
@@ -183,7 +184,7 @@ def test_a_page_without_server_answers_alike(busy_session, tmp_path, open_page):
 def page_session(folder, open_page, actions, frames=26, box="-1,-1,0,1,1,2"):
     """Keypoints after a session like `live_session` in a page without server."""
     write_scene(folder / "scene.ply", two_balls_scene())
-    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box=box)
+    options = SimulateOptions(engine="ngff", contact="learned", quality="draft", steps=2, keypoints=32, box=box)
     run(folder / "scene.ply", folder / "traj.h5", options)
     page = open_page(render(folder / "traj.h5", folder / "film.html", RenderOptions(playable=True)))
     messages = {n: actions(n, None) for n in range(frames)}

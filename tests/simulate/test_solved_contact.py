@@ -1,4 +1,4 @@
-"""`--engine ngff --contact solved` against textbook physics, through the stage."""
+"""Solved contacts of the learned field against textbook physics, through the stage, and when they are taken."""
 
 import pytest
 
@@ -28,10 +28,18 @@ def test_agrees_with_theory(device, name):
     test_agrees_with_theory_where_learned_contact_does_not(device, name)
 
 
-def test_is_an_option_of_the_learned_field():
-    with pytest.raises(InputError, match="--contact hard: choose from learned, solved"):
+def test_is_the_default_for_stiff_bodies():
+    with pytest.raises(InputError, match="--contact hard: choose from auto, learned, solved"):
         SimulateOptions(contact="hard")
     with pytest.raises(InputError, match="--contact solved: only for --engine ngff, not for rigid"):
         SimulateOptions(engine="rigid", contact="solved")
     scene = two_balls_scene()
-    assert with_engine(SimulateOptions(contact="solved"), scene, choose_keypoints(scene, 32)).engine == "ngff"
+
+    def chosen(**options):
+        return with_engine(SimulateOptions(**options), scene, choose_keypoints(scene, 32))
+
+    assert chosen(contact="solved").engine == "ngff"
+    soft = {"material": ("1=pillow",)}
+    for options, contact in (({}, "solved"), (soft, "learned"), ({"integrator": "rk4"}, "learned"),
+                             ({**soft, "contact": "solved"}, "solved")):  # fmt: skip
+        assert chosen(engine="ngff", **options).contact == contact

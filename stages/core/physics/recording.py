@@ -18,7 +18,7 @@ from stages.core.scene.schema import number, reason, rows, table, text, texts, w
 # Options of `ngff simulate` that --forces repeats -> checks of their values; not those that name other files.
 OPTIONS: dict[str, Callable] = {
     "dt": number, "engine": text, "gravity": number, "quality": text, "material": texts, "floor": number,
-    "friction": number, "box": text, "keypoints": whole, "integrator": text,
+    "friction": number, "box": text, "keypoints": whole, "integrator": text, "contact": text,
     "seed": lambda value, what: whole(value, what, 0, MAX_SEED),
 }  # fmt: skip
 

@@ -36,7 +36,7 @@ class PhysicsBenchOptions:
     quality: str = "draft"  # of MPM
     keypoints: int = 256
     weights: Path | None = None  # of the learned engine
-    contact: str = "learned"  # of the engine ngff
+    contact: str = AUTO  # of the engine ngff
     device: str = "auto"
 
     def __post_init__(self):
@@ -81,7 +81,7 @@ def trajectory(run: Run, engine: str, options: PhysicsBenchOptions) -> Trajector
         scene, materials, out = (Path(folder) / name for name in ("scene.ply", "materials.json", "traj.h5"))
         write_scene(scene, run.scene())
         materials.write_text(json.dumps({str(i + 1): body.material() for i, body in enumerate(run.bodies)}))
-        contact = options.contact if engine == "ngff" else "learned"
+        contact = options.contact if engine == "ngff" else AUTO
         weights = options.weights if engine != AUTO and ENGINES[engine].weights else None
         simulate(scene, out, SimulateOptions(
             engine=engine, materials=materials, quality=options.quality, keypoints=options.keypoints, weights=weights,
@@ -109,7 +109,7 @@ def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iter
     table, device = experiments(), pick_device(options.device)
     facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}, "quality": options.quality,
                                     "contact": options.contact}  # fmt: skip
-    for name, default in (("quality", None), ("contact", "learned")):
+    for name, default in (("quality", None), ("contact", "learned")):  # of tables from before
         if (before := facts.get(name, default)) != getattr(options, name):
             raise InputError(f"{out}: has rows measured at --{name} {before}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}

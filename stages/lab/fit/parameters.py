@@ -27,7 +27,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "density": Quantity(-1.0, 1.0, 0.15, log=True, relative=True, what="density over that of the first object"),
     "E": Quantity(3.0, 8.0, 0.5, log=True, what="Young's modulus [Pa]"),
 }
-OF_ENGINE = {"rigid": ("friction", "loss", "density")}  # others: all; without effect, it is not identifiable
+RIGID = ("friction", "loss", "density")  # quantities that act on rigid motion; others are not identifiable from it
 AXES = "xyz"
 SPEED_RANGE = 1.0  # about the speed that the first frames suggest [scene units/s]
 STEP, SPEED_STEP = 0.25, 0.1  # first standard deviations of the search, in ranges

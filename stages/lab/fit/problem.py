@@ -27,8 +27,8 @@ from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import (
     AXES,
-    OF_ENGINE,
     QUANTITIES,
+    RIGID,
     Parameter,
     as_json,
     fitted,
@@ -237,7 +237,7 @@ def _parameters(
     Without forces a common factor of all densities changes nothing: the first object's stays.
     """
     parameters: list[Parameter] = []
-    names = OF_ENGINE.get(options.engine, tuple(QUANTITIES))
+    names = RIGID if options.engine == "rigid" or options.contact == "solved" else tuple(QUANTITIES)
     weighed = bool(prompts.forces)
     for o in scene.objects:
         mine = keypoints.object_id == o.id

@@ -76,10 +76,10 @@ SCENES = {  # scene, options
 }  # fmt: skip
 
 
-def simulated(folder, scene, frames=51, **options):
+def simulated(folder, scene, frames=51, contact="learned", **options):
     """A trajectory of the learned engine, 32 keypoints for each object."""
     write_scene(folder / "scene.ply", scene)
-    options = SimulateOptions(engine="ngff", keypoints=32, steps=frames, **options)
+    options = SimulateOptions(engine="ngff", contact=contact, keypoints=32, steps=frames, **options)
     simulate(folder / "scene.ply", folder / "traj.h5", options)
     return read_trajectory(folder / "traj.h5")
 
@@ -147,6 +147,7 @@ def test_only_motions_of_the_learned_field_are_playable(tmp_path):
     for wrong, message in (
         (replace(t, info=replace(t.info, engine="rigid")), "simulated by rigid"),
         (replace(t, field=None), "simulate again"),
+        (simulated(tmp_path, two_balls_scene(), frames=2, contact="solved"), "simulate again"),
         (replace(t, field=replace(t.field, units=replace(t.field.units, weights="0" * 64))), "NGFF_WEIGHTS"),
     ):
         with pytest.raises(InputError, match=message):

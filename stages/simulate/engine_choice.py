@@ -29,9 +29,9 @@ def with_engine(
     object by more than MAX_RIGID_SAG, nor the speed that the prompts give it by more than MAX_RIGID_IMPACT. Of the two
     engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
     learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
-    Options of learned engines (weights, an integrator, its contacts) select it. Its contacts are solved if no weight
-    compresses an object by more than MAX_SOLVED_SAG, and learned otherwise, with an integrator, since solved ones have
-    no rate of change, or with weights, which may be of a model without these contacts.
+    Options of learned engines (weights, an integrator, its contacts) select it. Its contacts are learned if weight
+    compresses an object by more than MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since solved
+    ones have no rate of change, or with weights, which may be of a model without these contacts; else they are solved.
     """
     engine = options.engine
     if engine == AUTO:
@@ -42,7 +42,7 @@ def with_engine(
     if options.weights is not None or options.integrator != "step":
         return replace(options, contact="learned")
     materials = choose_materials(scene.objects, options.material, options.materials)
-    soft = _soft(materials, scene, keypoints, options.gravity, MAX_SOLVED_SAG)
+    soft = [] if _sideways(prompts) else _soft(materials, scene, keypoints, options.gravity, MAX_SOLVED_SAG)
     if soft:
         log.info("--contact learned, as object %d is compressed by more than %.0f %% by its own weight",
                  soft[0].id, 100 * MAX_SOLVED_SAG)  # fmt: skip

@@ -134,7 +134,11 @@ EXHAUSTED = [
     (("reconstruct", "{}/damaged", "-o", "{}/o.ply"), "photo_reader:_is_truncated", "--quality or --resolution"),
     (("segment", "{}/good.ply", "-o", "{}/o.ply"), "stage:rename_objects", "--max-objects"),
     (("refine", "{}/good.ply", "-o", "{}/o.ply"), "stage:fill_background", "--resolution"),
-    (("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "ngff"), "learned:TimeStepper", "--quality or --keypoints"),
+    (
+        ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "ngff"),
+        "learned:TimeStepper",
+        "--quality or --keypoints",
+    ),
     (("render", "{}/good.h5", "-o", "{}/o.mp4"), "draw:rasterise", "--resolution"),
 ]
 

@@ -3,6 +3,7 @@
 import pytest
 
 from stages.core.errors import InputError
+from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.lab.bench.physics import PhysicsBenchOptions, measure
 from stages.lab.bench.physics_experiments import experiments
@@ -43,3 +44,6 @@ def test_is_the_default_for_stiff_bodies():
     for options, contact in (({}, "solved"), (soft, "learned"), ({"integrator": "rk4"}, "learned"),
                              ({**soft, "contact": "solved"}, "solved")):  # fmt: skip
         assert chosen(engine="ngff", **options).contact == contact
+    thrown = ForcePrompts(velocity={2: (0.5, 0.0, 0.0)})
+    options = SimulateOptions(engine="ngff", **soft)
+    assert with_engine(options, scene, choose_keypoints(scene, 32), thrown).contact == "solved"

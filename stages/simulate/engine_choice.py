@@ -30,8 +30,9 @@ def with_engine(
     engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
     learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
     Options of learned engines (weights, an integrator, its contacts) select it. Its contacts are learned if weight
-    compresses an object by more than MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since solved
-    ones have no rate of change, or with weights, which may be of a model without these contacts; else they are solved.
+    compresses an object by more than MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since
+    solved ones have no rate of change, or with weights, which may be of a model without these contacts; else they are
+    solved.
     """
     engine = options.engine
     if engine == AUTO:

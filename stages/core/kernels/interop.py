@@ -87,6 +87,8 @@ def empty_arrays(struct, device: str, shape: tuple[int, ...], **other: tuple[int
     """
     out = struct()
     for name, field in struct.vars.items():
+        if not hasattr(field.type, "dtype"):  # a number
+            continue
         if (size := other.get(name, shape)) is not None:
             setattr(out, name, wp.empty(size, dtype=field.type.dtype, device=device))
     return out

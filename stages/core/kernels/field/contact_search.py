@@ -23,6 +23,7 @@ MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the w
 # Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
 # Larger for points on a face: otherwise an edge that passes over them gives contacts with oblique normals.
 MIN_FACING, MIN_FACING_OF_FACE = wp.constant(0.3), wp.constant(0.9)
+STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
 CLOSEST_POINT_STEPS = wp.constant(3)  # to the point of a ball that is nearest to a surface
 
 
@@ -57,6 +58,9 @@ class BodyPoses:
     high: wp.array2d[wp.vec3]
     margin: wp.array2d[float]  # gap up to which contacts are looked for [m]
     pinned: wp.array2d[wp.bool]
+    velocity: wp.array2d[wp.vec3]
+    spin: wp.array2d[wp.vec3]
+    step: float  # [s]
 
 
 @wp.struct
@@ -168,6 +172,13 @@ def _local(poses: BodyPoses, scene: int, body: int, x: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def _relative_velocity(poses: BodyPoses, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
+    """Velocity of body a relative to b at x."""
+    own = poses.velocity[scene, a] + wp.cross(poses.spin[scene, a], x - poses.com[scene, a])
+    return own - poses.velocity[scene, b] - wp.cross(poses.spin[scene, b], x - poses.com[scene, b])
+
+
+@wp.func
 def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, q: int) -> NearPoint:
     """Sample q of body a at body b."""
     out = NearPoint()
@@ -175,6 +186,12 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
     out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
     x = _local(poses, scene, b, out.at)
     found = depth_at(s, b, x)
+    way = poses.step * (wp.transpose(R) * _relative_velocity(poses, scene, a, b, out.at))
+    if wp.length(way) > STEP_OF_A_CELL * s.spacing[b]:
+        later = depth_at(s, b, x + way)
+        if later[3] < 0.0:  # it stays outside, and may pass an edge whose normal would stop it
+            later[3] = later[3] - wp.dot(wp.vec3(later[0], later[1], later[2]), way)
+            found = later
     out.normal = -(R * wp.vec3(found[0], found[1], found[2]))
     out.gap = s.overlap[a, b] - found[3]
     own = poses.R[scene, a] * s.normals[a, q]

@@ -368,7 +368,7 @@ class RigidFrames:
         contacts, samples = CONTACTS_PER_BODY * o, surfaces["samples"].shape[1]
         self.group = 1 if device == "cpu" else GROUP
         self.motion = empty_arrays(BodyMotion, device, (b, o))
-        self.poses = empty_arrays(BodyPoses, device, (b, o), low=None, high=None, pinned=None)
+        self.poses = empty_arrays(BodyPoses, device, (b, o), low=None, high=None, pinned=None, velocity=None, spin=None)
         slots, each = (b, o * o * SLOTS), (b, o * o, samples)
         self.found = empty_arrays(
             Found, device, (b, o * o), score=slots, row=slots, side=each, gap=each, other=each, near=each
@@ -394,6 +394,7 @@ class RigidFrames:
         load = new["com"].new_zeros(2, *self.shape[:2], 3)
         with_arrays(self.motion, new)
         with_arrays(self.poses, {"com": new["com"], "low": box[:, :, 0], "high": box[:, :, 1], "pinned": pinned})
+        self.poses.velocity, self.poses.spin, self.poses.step = self.motion.velocity, self.motion.spin, h
         with_arrays(self.inertia, {"mass": bodies["mass"], "pinned": pinned})
         with_arrays(self.patches, {"accelerations": accelerations, "load": load[0], "moment": load[1]})
         launch(

@@ -84,8 +84,11 @@ def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | N
 
 @cached_in_scene
 def convex_hulls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexHull | None]:
-    """The hulls of the objects that fill them, in the order of scene.objects; arguments as those of `convex_parts`."""
-    return [_filled_hull(solid) for solid in _solids(scene, seed, bottom)]
+    """The hulls of the objects that fill them, in the order of scene.objects; arguments as those of `convex_parts`.
+
+    Of the points in EXTREMES: hulls of all points of round objects have a face for every few Gaussians.
+    """
+    return [_filled_hull(solid, _extreme(solid.seen)) for solid in _solids(scene, seed, bottom)]
 
 
 @cached_in_scene
@@ -122,16 +125,16 @@ def _ball_parts(ball: Ball) -> ConvexParts:
 
 
 def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:
-    whole = _filled_hull(solid)
+    whole = _filled_hull(solid, solid.seen)
     if whole is not None:
         return ConvexParts((_vertices(whole, seed),), *_solid_moments(whole))
     hulls = _hulls(solid, divide(solid.voxels / solid.h, others / solid.h))
     return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), *solid.moments)
 
 
-def _filled_hull(solid: Solid) -> ConvexHull | None:
-    """Its convex hull, if it fills that."""
-    hull = _hull(solid.seen)
+def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
+    """The convex hull of its points, if it fills that."""
+    hull = _hull(points)
     return hull if hull is not None and hull.volume * CONVEX < solid.moments[0] else None
 
 

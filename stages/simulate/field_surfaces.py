@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
+from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from stages.core.physics.convex_cuts import EXTREMES
@@ -35,21 +36,20 @@ def body_surfaces(
 ) -> BodySurfaces:  # fmt: skip
     """The surfaces of all objects, each cut off at its floor [scene units], and their overlaps at the start."""
     com = centre_of_mass(initial, initial.points)
-    grids = []
     arms = torch.where(initial.valid[..., None], initial.points - com[:, :, None], 0.0)[0]
     floor = float(floors.min())
     found, hulls = balls(scene, seed, floor), convex_hulls(scene, seed, floor)
-    for row, o in enumerate(scene.objects):
-        own = arms[row, initial.valid[0, row]]
-        surface = solid_surface(scene, o.id, seed).fitted
-        _, first = surface.depth_grid()
+
+    def grid(row: int) -> BodyGrid:
         start = units.to_model(lift[row]) - com[0, row]  # of the origin of the scene, in the body's frame
-        shape = _Shape(surface, hulls[row], float(floors[row]))
-        grid = _grid(shape, own, start, units.length, seed)
-        if (ball := found[row]) is not None:
-            centre = start + units.length * torch.from_numpy(ball.centre).float()
-            grid = replace(grid, ball=(centre, units.length * ball.radius))
-        grids.append(grid)
+        shape = _Shape(solid_surface(scene, scene.objects[row].id, seed).fitted, hulls[row], float(floors[row]))
+        out = _grid(shape, arms[row, initial.valid[0, row]], start, units.length, seed)
+        if (ball := found[row]) is None:
+            return out
+        centre = start + units.length * torch.from_numpy(ball.centre).float()
+        return replace(out, ball=(centre, units.length * ball.radius))
+
+    grids = parallel_map(grid, range(len(scene.objects)))
     surfaces = BodySurfaces.of(grids)
     return replace(surfaces, overlap=_overlaps(surfaces, com[0]))
 
@@ -110,12 +110,12 @@ def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], l
     keypoints = cKDTree(arm.numpy())
     nodes = np.argwhere(np.abs(depth) < NEAR * shape.surface.h)
     keypoint = np.zeros(depth.shape, np.int64)
-    keypoint[tuple(nodes.T)] = keypoints.query(low.numpy() + h * nodes, workers=-1)[1]
+    keypoint[tuple(nodes.T)] = keypoints.query(low.numpy() + h * nodes)[1]
     smooth = ndimage.gaussian_filter(depth, 1.0)
     on_grid = (torch.from_numpy(length * x).float() for x in (depth, smooth))
     points, normals = (torch.from_numpy(x).float() for x in shape.samples(seed))
     at = start + length * points
-    near = torch.from_numpy(keypoints.query(at.numpy(), workers=-1)[1])
+    near = torch.from_numpy(keypoints.query(at.numpy())[1])
     return BodyGrid(*on_grid, torch.from_numpy(keypoint), low, h, at, normals, near)
 
 

@@ -29,11 +29,10 @@ class Dynamics(nn.Module, ABC):
     A model defines `initial_state`, `state_from_motion`, `derivative` and `points`.
     `inputs`: the fields of InitialConditions that the model uses; callers warn about those that it ignores.
     `config`: the arguments that build the model again.
-    `capturable`: whether a CUDA graph can hold a step, which then must not wait for the GPU.
+    On a GPU a step must not wait for it, since CUDA graphs hold steps.
     """
 
     inputs: ClassVar[frozenset[str]] = frozenset()
-    capturable: ClassVar[bool] = True
     config: dict
 
     def precompute(self, initial: InitialConditions) -> Any:

@@ -50,7 +50,7 @@ class TimeStepper:
     @torch.no_grad()
     def step(self) -> None:
         """Advance by dt."""
-        if not (self.step_count.is_cuda and self.model.capturable) or self.method != "step":
+        if not self.step_count.is_cuda or self.method != "step":
             return self._step()
         if self._replay_step is None:
             self._replay_step = self._captured_step()
@@ -61,7 +61,7 @@ class TimeStepper:
         """Start again at time 0 from inputs of the same shapes. Raises ValueError for other shapes."""
         external = ExternalForces.none(initial) if external is None else external
         _load((self.initial, self.external), (initial, external))
-        if not (self.step_count.is_cuda and self.model.capturable):
+        if not self.step_count.is_cuda:
             return self._begin()
         if self._replay_begin is None:  # the scene then lies in the memory of this graph, which steps must read
             self._replay_begin, self._replay_step = _captured(self._begin), None

@@ -3,8 +3,8 @@
 For one scene whose bodies' surfaces are known. Contact of the published simulation, which `ForceField` has learned,
 makes bodies stick and knows one coefficient of friction. Here bodies do not enter each other, friction and restitution
 are those of the materials, and the learned deformation answers the forces that this takes. Contacts are those of the
-undeformed surfaces: forces at single keypoints, as the solution has them, dent a body as those of the training never
-did, and contacts of dents did not come to rest.
+undeformed surfaces: the network's displacements under a lasting load do not become constant, so that bodies on deformed
+surfaces did not come to rest.
 """
 
 from __future__ import annotations

@@ -19,15 +19,16 @@ from torch import Tensor
 from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
-from stages.core.physics.convex_cuts import EXTREMES
+from stages.core.physics.convex_cuts import extreme_rows
 from stages.core.physics.convex_parts import balls, convex_hulls
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.physics.surface_faces import NEAR, nearest_points, surface_faces
 from stages.core.scene.scene import Scene
 from stages.simulate.model_units import ModelUnits
 
 SAMPLES = 512  # points of a body that are looked up in others, about a twentieth of its size apart
-NEAR = 4  # voxels from the surface up to which the nearest keypoint is found
+ON_EDGE = 1e-3  # difference of distances from two faces below which a point is on the edge between them [voxels]
 
 
 def body_surfaces(
@@ -72,13 +73,16 @@ class _Shape:
         height = first[2] + self.surface.h * np.arange(depth.shape[2]) - self.floor
         return np.minimum(depth, height), first
 
-    def samples(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points (k, 3) and normals (k, 3): the outermost points, and others far from each other."""
-        points, normals = self.surface.samples()
-        if self.hull is not None:
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (p, 3) of the surface, and outward normals (p, 3)."""
+        if self.hull is None:
+            points, normals = self.surface.samples()
+        else:
+            points = self.surface.points[self.surface.thinned()]
             beyond, faces = self._beyond_faces(points), self._faces[:, :3]
-            face = beyond.argmax(1)
-            on_faces = points - beyond.max(1, keepdims=True) * faces[face]
+            highest = beyond.max(1, keepdims=True)
+            face = (beyond >= highest - ON_EDGE * self.surface.h).argmax(1)
+            on_faces = points - highest * faces[face]
             corners = self.hull.points[self.hull.vertices]
             nearest = self._beyond_faces(corners) > -self.surface.h
             mean = nearest.astype(float) @ faces
@@ -86,15 +90,13 @@ class _Shape:
             points = np.concatenate([corners, on_faces])
         if (above := points[:, 2] > self.floor - self.surface.h).any():
             points, normals = np.maximum(points[above], [-np.inf, -np.inf, self.floor]), normals[above]
-        outer = np.unique((EXTREMES @ points.T).argmax(1))
-        others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
-        chosen = np.union1d(outer, others)
-        return points[chosen], normals[chosen]
+        return points, normals
 
     @cached_property
     def _faces(self) -> np.ndarray:
         """Normals and offsets (f, 4) of the hull's faces, one for those in a plane."""
-        _, first = np.unique(self.hull.equations.round(5), axis=0, return_index=True)
+        size = np.ptp(self.hull.points, axis=0).max()
+        _, first = np.unique((self.hull.equations / [1, 1, 1, size]).round(5), axis=0, return_index=True)
         return self.hull.equations[first]
 
     def _beyond_faces(self, x: np.ndarray) -> np.ndarray:
@@ -107,16 +109,20 @@ def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], l
     """The grid of a body with keypoints at `arm` [m]; `start` is the origin of the scene in the body's frame [m]."""
     depth, first = shape.depth_grid()
     low, h = start + length * torch.from_numpy(first).float(), length * shape.surface.h
-    keypoints = cKDTree(arm.numpy())
-    nodes = np.argwhere(np.abs(depth) < NEAR * shape.surface.h)
-    keypoint = np.zeros(depth.shape, np.int64)
-    keypoint[tuple(nodes.T)] = keypoints.query(low.numpy() + h * nodes)[1]
+    points, normals = shape.points()
+    flatness, faces = surface_faces(points, normals)
+    outer = extreme_rows(points)
+    others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
+    row = np.union1d(outer, others)  # the outermost, and others far from each other
+    points = start.numpy() + length * points
+    grid = length * depth, low.numpy(), h
+    keypoint, nearest = nearest_points(arm.numpy(), *grid).clip(0), nearest_points(points, *grid)
     smooth = ndimage.gaussian_filter(depth, 1.0)
     on_grid = (torch.from_numpy(length * x).float() for x in (depth, smooth))
-    points, normals = (torch.from_numpy(x).float() for x in shape.samples(seed))
-    at = start + length * points
-    near = torch.from_numpy(keypoints.query(at.numpy())[1])
-    return BodyGrid(*on_grid, torch.from_numpy(keypoint), low, h, at, normals, near)
+    near = cKDTree(arm.numpy()).query(points[row])[1]
+    at, normals, flatness, faces = (torch.from_numpy(x).float() for x in (points[row], normals[row], flatness, faces))
+    near, row, keypoint, nearest = map(torch.from_numpy, (near, row, keypoint, nearest))
+    return BodyGrid(*on_grid, keypoint, low, h, at, normals, near, row, flatness, faces, nearest)
 
 
 def _overlaps(surfaces: BodySurfaces, com: Float[Tensor, "o 3"]) -> Float[Tensor, "o o"]:

@@ -295,7 +295,7 @@ class _World:
             stage(model, data)
         count = data.ncon
         if self._surfaces is not None:
-            self._surfaces.thin(data, self._overlaps.distances(data))
+            self._surfaces.exclude(data)
             self._surfaces.add(data, self._resting.fixed)
         if self._edges is not None:
             self._edges.apply(data, self._resting.fixed)

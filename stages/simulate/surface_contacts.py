@@ -22,7 +22,7 @@ contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -30,8 +30,12 @@ from scipy.spatial import ConvexHull, QhullError
 from stages.core.kernels.depth_lookup import depth_lookup, turned
 from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface
+from stages.core.physics.surface_faces import FACES, nearest_points, surface_faces
 from stages.simulate.initial_overlaps import WINDOW
 
+FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
+OPPOSED = 0.9  # least cosine of the angle at which two faces are parallel, at the edges of both
+CURVED = 5e-4  # difference of the flatness of surfaces that counts: a plane has 1, a ball of 2000 samples .998
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
 BALL_NODES = 20  # along its radius: depths between them are interpolated to .001 radii
@@ -47,20 +51,27 @@ class SurfaceShape:
 
     points: np.ndarray  # (s, 3)
     normals: np.ndarray  # (s, 3), outwards
+    flatness: np.ndarray  # (s,), 1 in a plane and 0 at an edge
+    faces: np.ndarray  # (s, 3, 3), normals of up to three faces that meet there, the others 0
+    nearest: np.ndarray  # (x, y, z), sample nearest to each node near the surface
     depth: np.ndarray  # (x, y, z)
     low: np.ndarray  # (3,), the first node
     h: float  # between nodes
     convex: bool  # fills its convex hull
+    radius: float = 0.0  # of a ball
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of a ball
 
 
 def surface_shape(body: SolidSurface, bottom: float, com: np.ndarray, scale: float, convex: bool) -> SurfaceShape:
     """The shape of a body that ends at the height `bottom`, in a frame at `com` with `scale` units per scene unit."""
-    points, normals = body.samples()
+    points, normals = body.fitted.samples()
     above = points[:, 2] > bottom
-    depth, low = body.depth_grid()
+    points, normals = scale * (points[above] - com), normals[above]
+    depth, low = body.fitted.depth_grid()
     height = low[2] + body.h * np.arange(depth.shape[2])
-    return SurfaceShape(scale * (points[above] - com), normals[above], scale * np.minimum(depth, height - bottom),
-                        scale * (low - com), scale * body.h, convex)  # fmt: skip
+    depth, low, h = scale * np.minimum(depth, height - bottom), scale * (low - com), scale * body.h
+    return SurfaceShape(points, normals, *surface_faces(points, normals), nearest_points(points, depth, low, h),
+                        depth, low, h, convex)  # fmt: skip
 
 
 def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:
@@ -69,7 +80,9 @@ def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:
     low = np.full(3, -(BALL_NODES + 2) * h)
     node = low + h * np.indices((2 * BALL_NODES + 5,) * 3).transpose(1, 2, 3, 0)
     depth = radius - np.linalg.norm(node, axis=-1)
-    return SurfaceShape(centre + radius * normals, normals, depth, centre + low, h, True)
+    nearest = nearest_points(radius * normals, depth, low, h)
+    return SurfaceShape(centre + radius * normals, normals, *surface_faces(normals, normals), nearest, depth,
+                        centre + low, h, True, radius, centre)  # fmt: skip
 
 
 class SurfaceContacts:
@@ -79,17 +92,22 @@ class SurfaceContacts:
         self._mujoco, self._model = mujoco, model
         count = len(shapes)
         groups = [_groups(s.points) for s in shapes]
-        shapes = [replace(s, points=s.points[order], normals=s.normals[order])
-                  for s, (order, *_) in zip(shapes, groups, strict=True)]  # fmt: skip
-        self._points, self._normals = (np.concatenate([getattr(s, n) for s in shapes]) for n in ("points", "normals"))
+        shapes = [_ordered(s, order) for s, (order, *_) in zip(shapes, groups, strict=True)]
+        self._points, self._normals, self._flatness, self._faces = (
+            np.concatenate([getattr(s, n) for s in shapes]) for n in ("points", "normals", "flatness", "faces")
+        )
         self._first = np.cumsum([0, *(len(s.points) for s in shapes)])
         self._first_group = np.cumsum([0, *(len(g[1]) for g in groups)])
         self._begin = np.concatenate([first + g[1] for first, g in zip(self._first, groups, strict=False)])
         self._ends = np.append(self._begin[1:], len(self._points))
         self._middle, self._reach = (np.concatenate([g[k] for g in groups]) for k in (2, 3))
         self._radius = np.array([np.linalg.norm(s.points, axis=1).max(initial=0) for s in shapes])
+        self._nearest = np.concatenate(
+            [np.where(s.nearest < 0, -1, f + s.nearest).ravel() for f, s in zip(self._first, shapes, strict=False)]
+        )
         self._lookup = depth_lookup([s.depth for s in shapes], np.array([s.low for s in shapes]),
                                     np.array([s.h for s in shapes]))  # fmt: skip
+        self._ball, self._centre = np.array([s.radius for s in shapes]), np.array([s.centre for s in shapes])
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
         self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -135,6 +153,7 @@ class SurfaceContacts:
         self._note((depth, a, b), fixed)
         excess = depth - self._allowed[a, b]
         k = np.flatnonzero(excess > 0)
+        k = k[_extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
         one, two = self._geom[b[k]], self._geom[a[k]]
         x, normal, excess = x[k] + depth[k, None] / 2 * normal[k], normal[k], excess[k]
         row, plane, depth = self._beyond_planes(data, fixed)
@@ -147,23 +166,10 @@ class SurfaceContacts:
             x, depth = np.concatenate([at, x]), np.append(depth, excess)
             add_contacts(self._mujoco, self._model, data, x, normal, depth, one, two)
 
-    def thin(self, data, distance: np.ndarray) -> None:
-        """Exclude those of the contacts (k,) of parts that are beside deeper ones, by their distances (k,)."""
+    def exclude(self, data) -> None:
+        """Exclude the contacts of parts of two bodies whose surfaces are looked up."""
         body = self._body[data.contact.geom]
-        rough = np.flatnonzero(self._rough[body].any(1))
-        if not len(rough):
-            return
-        body, normal = body[rough], data.contact.frame[rough, :3]
-        small = np.where(self._edge[body[:, 0]] < self._edge[body[:, 1]], *body.T)
-        turn = data.xmat[1 + small].reshape(-1, 3, 3)
-        local = ((data.contact.pos[rough] - data.xpos[1 + small])[:, None] @ turn)[:, 0]
-        cell = np.floor(local / self._edge[small, None]).astype(np.int64)
-        axis = np.abs(normal).argmax(1)
-        side = 2 * axis + (normal[np.arange(len(rough)), axis] > 0)
-        key = np.ravel_multi_index((*(body.T + 1), *(cell.T + CELLS), side), self._keys, mode="clip")
-        order = np.lexsort((-distance[rough], key))
-        beside = key[order[1:]] == key[order[:-1]]
-        data.contact.exclude[rough[order[:-1][beside]]] = 1
+        data.contact.exclude[(body >= 0).all(1) & self._rough[body].any(1)] = 1
 
     def _note(self, contacts: tuple, fixed: np.ndarray) -> None:
         """Take the deepest samples of each pair; those of some substeps bound the overlap allowed from then on."""
@@ -226,9 +232,39 @@ class SurfaceContacts:
         k = np.flatnonzero(self._way[tuple(self._pairs.T)][self._pair] >= self._from)
         a, b = self._pairs[self._pair[k]].T.copy()
         sample = self._sample[k]
-        k, x, normal, depth = self._lookup.contacts(self._points[sample], self._normals[sample], a, b,
-                                                    *self._poses(data))  # fmt: skip
-        return x, normal, depth, a[k], b[k]
+        turn, at = self._poses(data)
+        k, x, outwards, depth, node = self._lookup.inside(self._points[sample], a, b, turn, at)
+        a, b, sample = a[k], b[k], sample[k]
+        normal, facing = self._facing(sample, self._nearest[node], outwards, turn[b].transpose(0, 2, 1) @ turn[a])
+        normal = turned(turn[b], normal)
+        for body, side in ((a, 1), (b, -1)):  # a ball touches where the normal through its centre meets its surface
+            row = np.flatnonzero(self._ball[body] > 0)
+            of = body[row]
+            x[row] = turned(turn[of], self._centre[of]) + at[of] - side * self._ball[of, None] * normal[row]
+            if side < 0:
+                x[row] -= depth[row, None] * normal[row]
+        return x, normal, depth * (facing / FACING).clip(0, 1), a, b
+
+    def _facing(self, sample: np.ndarray, other: np.ndarray, outwards: np.ndarray, turn: np.ndarray):
+        """Normals (k, 3) out of bodies b, in their frames, of contacts of samples (k,) of bodies a near samples (k,) of
+        b, and the cosines (k,) of the angles at which they face each other. `turn` (k, 3, 3) is from a to b.
+
+        Where b has an edge its depths increase in an oblique direction, `outwards` (k, 3). The normal is that of a
+        face: of faces that are parallel the one of the flatter surface, else that of a if its sample is on one.
+        """
+        own, faces = turned(turn, self._normals[sample]), self._faces[sample]
+        others = np.where(other[:, None, None] < 0, 0.0, self._faces[other])
+        cosine = -np.einsum("kij,kaj,kbi->kab", turn, faces, others)
+        cosine[~faces.any(2)] = -np.inf
+        cosine.swapaxes(1, 2)[~others.any(2)] = -np.inf
+        row, best = np.arange(len(sample)), cosine.reshape(len(sample), FACES**2).argmax(1)
+        most = cosine.reshape(len(sample), FACES**2)[row, best]
+        flatness = self._flatness[sample]
+        on_face, flatter = flatness > 0, self._flatness[other] > flatness + CURVED
+        normal = np.where(on_face[:, None], -own, outwards)
+        parallel = (most > OPPOSED) & (~on_face | flatter)
+        normal[parallel] = others[row, best % FACES][parallel]
+        return normal, np.where(np.isfinite(most), most, -(own * outwards).sum(1))
 
     def _poses(self, data) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (o, 3, 3) and positions (o, 3) of the bodies; the model has others after them."""
@@ -270,6 +306,14 @@ def add_contacts(mujoco, model, data, x, normal, excess, one, two) -> None:
     added.solimp[new] = model.geom_solimp[one]
 
 
+def _ordered(shape: SurfaceShape, order: np.ndarray) -> SurfaceShape:
+    """A shape with its samples in another order."""
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    per_sample = {n: getattr(shape, n)[order] for n in ("points", "normals", "flatness", "faces")}
+    return replace(shape, **per_sample, nearest=np.append(rank, -1)[shape.nearest])
+
+
 def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """An order of points (s, 3) by place; and of each of its groups the first row, the middle and the largest distance
     from it.
@@ -282,6 +326,23 @@ def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     middle = np.array([(g.min(0) + g.max(0)) / 2 for g in parts]).reshape(-1, 3)
     reach = np.array([np.linalg.norm(g - m, axis=1).max() for g, m in zip(parts, middle, strict=True)])
     return order, first, middle, reach
+
+
+def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Rows of the contacts of each pair that span it in eight directions across the normal, and the deepest.
+
+    For each of six directions of the normal. Source: Moravanszky and Terdiman 2004, "Fast contact reduction for
+    dynamics simulation".
+    """
+    axis = np.abs(normal).argmax(1)
+    row = np.arange(len(x))
+    key = 6 * pair + 2 * axis + (normal[row, axis] > 0)
+    u, v = x[row, (axis + 1) % 3], x[row, (axis + 2) % 3]
+    kept = []
+    for score in (u, -u, v, -v, u + v, u - v, -u + v, -u - v, depth):
+        order = np.lexsort((score, key))
+        kept.append(order[np.append(key[order[1:]] != key[order[:-1]], True)] if len(x) else order)
+    return np.unique(np.concatenate(kept))
 
 
 def _frames(normal: np.ndarray) -> np.ndarray:

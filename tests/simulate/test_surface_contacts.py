@@ -82,20 +82,21 @@ def test_distances_are_those_of_each_pair():
         assert contact.dist.min() == pytest.approx(alone.dist.min(), abs=1e-9) and len(contact.dist) == len(alone.dist)
 
 
-def test_of_contacts_side_by_side_only_the_deepest_takes_part():
-    """In cells of a sixth of the small ball's size; those with the floor have another direction."""
+def test_contacts_are_those_that_span_the_touching_patch_and_the_deepest():
+    """At most nine for each pair of surfaces and direction; contacts of parts beside them are excluded."""
     pair = Pair(0.5)
-    contact = pair.found(0.28, height=-0.03)
-    pair.contacts.thin(pair.data, contact.dist.copy())
-    kept, floor = contact.exclude == 0, contact.geom[:, 0] == 0
-    for mine in (floor, ~floor):
-        rows = np.flatnonzero(mine)
-        assert 1 <= kept[rows].sum() < len(rows) / 2 and kept[rows[contact.dist[rows].argmin()]]
-    assert set(contact.exclude) == {0, 1}
+    contact = pair.found(0.28)
+    assert 1 <= len(contact.dist) <= 2 * 6 * 9
+    pair.data.qpos[7] = pair.x + 0.0005  # now the middles, which MuJoCo knows, touch
+    mujoco.mj_fwdPosition(pair.model, pair.data)
+    assert pair.data.ncon == 1
+    pair.contacts.exclude(pair.data)
+    assert (pair.data.contact.exclude == 1).all()
     convex = Pair(0.5, convex=True)
-    convex.found(0.28)
-    convex.contacts.thin(convex.data, convex.data.contact.dist)
-    assert not convex.data.contact.exclude.any()
+    convex.data.qpos[7] = convex.x + 0.0005
+    mujoco.mj_fwdPosition(convex.model, convex.data)
+    convex.contacts.exclude(convex.data)
+    assert convex.data.ncon == 1 and not convex.data.contact.exclude.any()
 
 
 def test_separate_fixed_and_convex_bodies_have_none():
@@ -158,7 +159,7 @@ def test_voxels_around_a_symmetric_body_are_symmetric():
     line = 0.1 * np.arange(-4, 4.5)
     slab = np.stack(np.meshgrid(line, line, line[2:-2], indexing="ij"), -1).reshape(-1, 3)
     body = SolidSurface(slab + 0.05, 0.1, box((0.9, 0.9, 0.5), 0.03).points.double().numpy() + 0.05)
-    x, depth, inside = body.body_voxels()
+    x, depth, inside, _ = body.body_voxels()
     cells = np.round((x - 0.05) / 0.1).astype(int)
     assert len(x) == 11 * 11 * 7 and np.abs(cells).max(0).tolist() == [5, 5, 3]
     kept = {tuple(c) for c in cells[inside]}

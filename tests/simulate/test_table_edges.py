@@ -82,7 +82,7 @@ def test_what_slides_over_the_edge_lands_on_the_ground_and_does_not_sink(tmp_pat
     """By the command; with --floor the floor has no edge."""
     scene = on_table(block(0.2))
     write_scene(tmp_path / "scene.ply", scene)
-    options = {"velocity": ("object=1 2,0,0",), "steps": 42}
+    options = {"velocity": ("object=1 2,0,0",), "steps": 70}
     with caplog.at_level(logging.WARNING):
         run(tmp_path / "scene.ply", tmp_path / "t.h5", options_of(tmp_path, **options))
     assert "sinks" not in caplog.text

@@ -16,7 +16,6 @@ from scipy import ndimage
 from stages.core.kernels.interop import compiles_for_cpu
 
 _F, _I = wp.float64, wp.int64
-FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
 
 
@@ -52,24 +51,24 @@ class DepthLookup:
         # the body is in the box of its grid, so the angle at the nearest point of the box is at least a right one
         return np.where(beyond > 0, np.sqrt(beyond + np.maximum(distance, 0) ** 2), distance)
 
-    def contacts(
-        self, points: np.ndarray, normals: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points (k, 3) with outward normals (k, 3), in the frames of bodies a (k,), that are inside bodies b (k,).
+    def inside(
+        self, points: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points (k, 3) in the frames of bodies a (k,) that are inside bodies b (k,).
 
-        Returns their rows (m,), positions (m, 3), the outward normals (m, 3) of b, and depths (m,) in it, less where
-        the surfaces do not face each other.
+        Returns their rows (m,), positions (m, 3), directions (m, 3) out of b in its frame, depths (m,) in it, and rows
+        (m,) of the nearest nodes.
         """
         local = self._relative(points, a, b, turn, at)
         node, f = self._cells(b, local)
         within = (np.abs(f - 0.5) <= 0.5).all(1)
         depth = np.where(within, interpolated(self.depth[node], f), 0.0)
         k = np.flatnonzero(depth > 0)
-        normal = -turned(turn[b[k]], slope(self.smooth[node[k]], f[k]))
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
-        facing = -(turned(turn[a[k]], normals[k]) * normal).sum(1)
+        out = -slope(self.smooth[node[k]], f[k])
+        out /= np.linalg.norm(out, axis=1, keepdims=True).clip(1e-12)
         x = turned(turn[a[k]], points[k]) + at[a[k]]
-        return k, x, normal, depth[k] * (facing / FACING).clip(0, 1)
+        corner = (f[k] > 0.5) @ [4, 2, 1]
+        return k, x, out, depth[k], node[k, corner]
 
     def _relative(self, points, a, b, turn, at) -> np.ndarray:
         """Points in the frames of bodies b."""
@@ -97,14 +96,15 @@ class CompiledDepthLookup(DepthLookup):
     def _reserve(self, count: int) -> None:
         """Make room for `count` points."""
         self._room = count
-        self._points, self._normals, self._x, self._normal = (np.empty((count, 3)) for _ in range(4))
-        self._a, self._b, self._out = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+        self._points, self._x, self._outwards = (np.empty((count, 3)) for _ in range(3))
+        self._a, self._b, self._node = (np.empty(count, np.int64) for _ in range(3))
+        self._out = np.empty(count)
         out = _array(self._out, _F)
         inputs = [*self._grids, _array(self._points, wp.vec3d), _array(self._a, _I), _array(self._b, _I),
                   _array(self._turn, wp.mat33d), _array(self._at, wp.vec3d), out]  # fmt: skip
-        vectors = [_array(x, wp.vec3d) for x in (self._normals, self._x, self._normal)]
+        found = [_array(self._x, wp.vec3d), _array(self._outwards, wp.vec3d), _array(self._node, _I)]
         self._distance = wp.launch(_distance, count, inputs, device="cpu", record_cmd=True)
-        self._contact = wp.launch(_contact, count, [*inputs, FACING, *vectors], device="cpu", record_cmd=True)
+        self._inside = wp.launch(_inside, count, [*inputs, *found], device="cpu", record_cmd=True)
 
     def _put(self, points, a, b, turn, at) -> int:
         count = len(points)
@@ -122,15 +122,14 @@ class CompiledDepthLookup(DepthLookup):
         _run(self._distance, count)
         return self._out[:count].copy()
 
-    def contacts(
-        self, points: np.ndarray, normals: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """As those of DepthLookup."""
+    def inside(
+        self, points: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """As that of DepthLookup."""
         count = self._put(points, a, b, turn, at)
-        self._normals[:count] = normals
-        _run(self._contact, count)
-        k = np.flatnonzero(self._out[:count] >= 0)
-        return k, self._x[k], self._normal[k], self._out[k]
+        _run(self._inside, count)
+        k = np.flatnonzero(self._out[:count] > 0)
+        return k, self._x[k], self._outwards[k], self._out[k], self._node[k]
 
 
 def _array(values: np.ndarray, dtype) -> wp.array:
@@ -203,29 +202,30 @@ def _distance(
 
 
 @wp.kernel(enable_backward=False)
-def _contact(
+def _inside(
     depth: wp.array[wp.float64], smooth: wp.array[wp.float64], first: wp.array[wp.int64], shape: wp.array[wp.vec3l],
     low: wp.array[wp.vec3d], h: wp.array[wp.float64], points: wp.array[wp.vec3d], a: wp.array[wp.int64],
     b: wp.array[wp.int64], turn: wp.array[wp.mat33d], at: wp.array[wp.vec3d], out: wp.array[wp.float64],
-    facing: wp.float64, normals: wp.array[wp.vec3d], out_x: wp.array[wp.vec3d], out_normal: wp.array[wp.vec3d],
+    out_x: wp.array[wp.vec3d], outwards: wp.array[wp.vec3d], out_node: wp.array[wp.int64],
 ):  # fmt: skip
     i = wp.tid()
     own, other = wp.int32(a[i]), wp.int32(b[i])
-    zero, one = wp.float64(0.0), wp.float64(1.0)
+    zero, half, one = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
     x = turn[own] * points[i] + at[own]
     n = shape[other]
     node, f = _place(first[other], n, low[other], h[other], wp.transpose(turn[other]) * (x - at[other]))
-    out[i] = -one
+    out[i] = zero
     if wp.min(f) < zero or wp.max(f) > one:
         return
     inside = _interpolated(depth, node, n, f)
     if inside <= zero:
         return
-    normal = -(turn[other] * _gradient(smooth, node, n, f))
-    normal = normal / wp.max(wp.length(normal), wp.float64(1.0e-12))
+    direction = -_gradient(smooth, node, n, f)
     out_x[i] = x
-    out_normal[i] = normal
-    out[i] = inside * wp.clamp(-wp.dot(turn[own] * normals[i], normal) / facing, zero, one)
+    outwards[i] = direction / wp.max(wp.length(direction), wp.float64(1.0e-12))
+    out[i] = inside
+    right, up = wp.where(f[0] > half, n[1], wp.int64(0)), wp.where(f[1] > half, wp.int64(1), wp.int64(0))
+    out_node[i] = wp.int64(node) + (right + up) * n[2] + wp.where(f[2] > half, wp.int64(1), wp.int64(0))
 
 
 def turned(R: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -38,6 +38,17 @@ def fibonacci(count: int) -> np.ndarray:
 
 BOUNDS = np.concatenate([np.eye(3), -np.eye(3), fibonacci(48)]).astype(np.float32)
 EXTREMES = np.concatenate([np.eye(3), -np.eye(3), fibonacci(200)]).astype(np.float32)
+EQUALLY_FAR = 1e-5  # difference of heights relative to the largest, below which they count as equal
+
+
+def extreme_rows(points: np.ndarray, directions: np.ndarray = EXTREMES) -> np.ndarray:
+    """Sorted rows of those points (n, 3) that are the farthest in a direction, the first of those that are equally far.
+
+    Rounding therefore does not choose among the points of a flat side.
+    """
+    height = directions @ (points - points.mean(0)).T
+    top = height.max(1, keepdims=True)
+    return np.unique((height >= top - EQUALLY_FAR * top.max()).argmax(1))
 
 
 @dataclass(frozen=True)
@@ -107,7 +118,7 @@ class _Body:
         inside = self._within(candidates, BOUNDS[:6], reach[:6])  # first, as most others are not
         inside = self._within(inside, BOUNDS[6:], reach[6:])
         try:
-            faces = ConvexHull(points[np.unique((EXTREMES[::2] @ points.T).argmax(1))]).equations.astype(np.float32)
+            faces = ConvexHull(points[extreme_rows(points, EXTREMES[::2])]).equations.astype(np.float32)
             inside = self._within(inside, faces[:, :3], -faces[:, 3])
         except (QhullError, ValueError):  # flat: it has the space within its bounds
             pass

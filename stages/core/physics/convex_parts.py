@@ -18,7 +18,7 @@ from torch import Tensor
 
 from stages.core.kernels.threads import parallel_map
 from stages.core.physics.ball_fit import DENT, Ball, fitted_ball
-from stages.core.physics.convex_cuts import EXTREMES, divide
+from stages.core.physics.convex_cuts import EXTREMES, divide, extreme_rows
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
@@ -98,12 +98,12 @@ def _solids(scene: Scene, seed: int, bottom: float) -> list[Solid]:
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
     body = solid_surface(scene, object_id, seed)
-    voxels, depth, inside = body.body_voxels()
+    voxels, depth, inside, share = body.body_voxels()
     kept = voxels[:, 2] > min(bottom, float(voxels[inside, 2].max()) - body.h)
     inside = inside[kept]
     seen, surface = (np.column_stack([p[:, :2], p[:, 2].clip(min=bottom)]) for p in (body.seen, body.points))
     voxels, depth = voxels[kept], depth[kept]
-    moments = _voxel_moments(voxels, (depth / body.h + 0.5).clip(0, 1), body.h)
+    moments = _voxel_moments(voxels, share[kept], body.h)
     return Solid(voxels[inside], depth[inside], body.h, surface, body.normals, seen if len(seen) else voxels, moments)
 
 
@@ -201,11 +201,11 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
 
 def _close(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of points (n, 3) and of unit voxels at cells (m, 3) that are less than 1 from each other."""
-    index = np.floor(cells).astype(np.int64)
-    low = index.min(0) - 1
-    row = np.full(index.max(0) - low + 2, -1)
-    row[tuple((index - low).T)] = np.arange(len(cells))
-    x = points - low - 0.5
+    low = cells.min(0) - 1
+    index = np.rint(cells - low).astype(np.int64)
+    row = np.full(index.max(0) + 2, -1)
+    row[tuple(index.T)] = np.arange(len(cells))
+    x = points - low
     first = np.floor(x).astype(np.int64).clip(0, np.array(row.shape) - 2)
     pairs = []
     for corner in np.ndindex(2, 2, 2):
@@ -219,7 +219,7 @@ def _close(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _extreme(points: np.ndarray) -> np.ndarray:
     """The points that are extreme in one of EXTREMES."""
-    return points[np.unique((EXTREMES @ points.T).argmax(1))] if len(points) > len(EXTREMES) else points
+    return points[extreme_rows(points)] if len(points) > len(EXTREMES) else points
 
 
 def _balanced(hull: ConvexHull, surface: np.ndarray, normals: np.ndarray, h: float) -> ConvexHull:

@@ -16,21 +16,23 @@ from stages.core.scene.trajectory import Binding, Keypoints
 
 KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that each Gaussian follows
 MAX_CANDIDATES = 30_000  # Gaussians of an object among which keypoints are chosen
+EQUALLY_FAR = 0.9999  # ratio of squared distances above which they count as equal
 PULL_MARGIN = 0.15  # between the walls and the points to which a user can pull objects [extent of all objects]
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> Int[Tensor, "k"]:
     """Indices of min(count, n) points, each the farthest from those before it, starting from a random point.
 
-    Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance": within a factor of two
-    of the smallest possible covering radius.
+    Of points that are equally far, the first is taken, so that rounding does not choose between them. Source: Gonzalez
+    1985, "Clustering to minimize the maximum intercluster distance": within a factor of two of the smallest possible
+    covering radius.
     """
     count, xyz = min(count, len(points)), np.ascontiguousarray(points.detach().cpu().numpy().T)
     chosen = np.empty(count, np.int64)
     if not count:
         return torch.from_numpy(chosen)
     distance = np.full(xyz.shape[1], np.inf, xyz.dtype)
-    offset, square = np.empty_like(xyz), np.empty_like(distance)
+    offset, square, far = np.empty_like(xyz), np.empty_like(distance), np.empty(xyz.shape[1], bool)
     at = int(torch.randint(xyz.shape[1], (1,), generator=torch.Generator().manual_seed(seed)))
     for i in range(count):  # in place: for most objects the overhead of the calls dominates
         chosen[i] = at
@@ -38,7 +40,8 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
         np.square(offset, out=offset)
         np.add(offset[0], offset[1], out=square)
         np.add(square, offset[2], out=square)
-        at = int(np.minimum(distance, square, out=distance).argmax())
+        farthest = np.minimum(distance, square, out=distance).max()
+        at = int(np.greater_equal(distance, EQUALLY_FAR * farthest, out=far).argmax())
     return torch.from_numpy(chosen)
 
 

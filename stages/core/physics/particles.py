@@ -39,6 +39,7 @@ MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (
 MIN_PARTICLES = 40  # per object
 MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
+START = 0.25  # of the object's bounds in their voxel
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 
@@ -130,7 +131,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     gap = _spacing(means) or size / 50
     scales = good.scales.double().clamp(max=max(size / 6, 1e-9) if len(good) > 1 else float(good.scales.median()))
     area = scales.sort(1).values[:, 1:].prod(1) * 4 / max(gap, 1e-12) ** 2
-    each = area.clamp(1, 32).ceil().long()
+    each = (area.clamp(1, 32) - 1e-3).ceil().long()  # at a whole number rounding must not decide
     each = (each * min(1.0, MAX_SURFACE_SAMPLES / float(each.sum()))).long().clamp_min(1)
     rng = torch.Generator().manual_seed(seed)
     of = torch.arange(len(good)).repeat_interleave(each)
@@ -152,7 +153,8 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
 def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tuple[Float[Tensor, "m 3"], float]:
     """Centres of the voxels of an object's filled body, its skin included, and their edge.
 
-    There are about `along` voxels along its longest side, fewer where its surface is sampled too coarsely. Raises
+    There are about `along` voxels along its longest side, fewer where its surface is sampled too coarsely. The object's
+    lower bounds are within the first ones, so that rounding does not decide in which voxels flat sides are. Raises
     InputError for an object without any usable Gaussian.
     """
     points, gap = _cloud(scene, object_id, seed)
@@ -160,9 +162,10 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     ways = (True, False) if _stands(points, h, scene.floor) else (False,)
-    bodies = [_closed_body(points, h, gap, standing, photographed=False)[:2] for standing in ways]
+    first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
+    bodies = [_closed_body(points - (first - h / 2), h, gap, standing, photographed=False)[:2] for standing in ways]
     body, low = max(bodies, key=lambda found: found[0].sum())
-    return torch.from_numpy((np.argwhere(body) + low + 0.5) * h).float(), h
+    return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
 def _solid(

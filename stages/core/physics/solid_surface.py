@@ -20,13 +20,18 @@ from stages.core.physics.particles import filled_voxels, inliers, usable_means
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-VOXELS_ALONG = 48  # voxels along the longest side of an object
+VOXELS_ALONG = 48  # voxels along a side of a cube
+MIN_SLOPE = 0.12  # of smoothed voxels where the direction out of the body is clear, .4 at the face of a thick one
+SLENDER = 16  # ratio of longest to shortest side beyond which voxels do not get smaller
 MOST_ALONG = 96  # of one that is larger than the others, so that it is as accurate as these where it touches them
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
 NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on the same face count
-MIN_ON_FACE = 6  # samples on the same face below which the normal is kept
+MIN_ON_FACE = 6  # samples on the same face by their first normals below which all on the same side are fitted at first
+FITS = 4  # of a plane, with weights that fall with the distance from it
+FLATNESS = 0.1  # distance at which weights fall even if the others are closer [spacing of the samples]
+OCTANTS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -36,10 +41,10 @@ class SolidSurface:
     def __init__(self, voxels: np.ndarray, h: float, points: np.ndarray):
         """`voxels` (m, 3) are centres of edge h; `points` (n, 3) are about on the surface."""
         self.voxels, self.h, self.seen = voxels, h, points
-        cells = np.floor(voxels / h).astype(np.int64)
-        self._low = cells.min(0) - 2
-        full = np.zeros(cells.max(0) - self._low + 3, bool)
-        full[tuple((cells - self._low).T)] = True
+        self._first = voxels.min(0) - 2 * h  # centre of the first voxel of the grid
+        cells = self._cells(voxels)
+        full = np.zeros(cells.max(0) + 3, bool)
+        full[tuple(cells.T)] = True
         self._full = full
         inside, outside = (ndimage.distance_transform_edt(part) - 0.5 for part in (full, ~full))
         self._depth = h * np.where(full, inside, -outside)  # to the faces of the voxels
@@ -47,8 +52,9 @@ class SolidSurface:
         smooth = ndimage.gaussian_filter(full.astype(np.float32), 1.0)
         normals = -np.stack([self._at(slope, near) for slope in np.gradient(smooth)], 1)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        near, normals = near[length[:, 0] > 1e-3], (normals / length.clip(1e-3))[length[:, 0] > 1e-3]
-        open_ = np.stack([~full[tuple((cells - self._low + step).T)] for step in STEPS], 1)
+        clear = length[:, 0] > MIN_SLOPE
+        near, normals = near[clear], normals[clear] / length[clear]
+        open_ = np.stack([~full[tuple((cells + step).T)] for step in STEPS], 1)
         row, side = np.nonzero(open_)
         faces, outward = voxels[row] + h / 2 * STEPS[side], STEPS[side].astype(float)
         if len(near):
@@ -63,19 +69,25 @@ class SolidSurface:
     def fitted(self) -> SolidSurface:
         """The same with the planes that fit the neighbours of each sample on the same face.
 
-        At a flat face of exact samples the normals are then .2 degrees off, instead of 4 with the normals of voxels.
+        By iteratively reweighted least squares, so that the planes of samples at an edge are those of one face.
         """
         out = copy.copy(self)
         vars(out).pop("_depth_grid", None)  # of the other samples
-        row = np.minimum(self._tree.query(self.points, NEIGHBOURS)[1], len(self.points) - 1)
-        weight = ((self.normals[row] * self.normals[:, None]).sum(-1) > SAME_FACE).astype(float)
-        middle = (weight[..., None] * self.points[row]).sum(1) / weight.sum(1, keepdims=True)
-        arm = (self.points[row] - middle[:, None]) * weight[..., None]
-        normals = np.linalg.eigh(np.einsum("nka,nkb->nab", arm, arm))[1][:, :, 0]
+        distance, row = self._tree.query(self.points, NEIGHBOURS + 1)
+        distance, row = distance[:, :-1] / distance[:, -1:], np.minimum(row[:, :-1], len(self.points) - 1)
+        along = (self.normals[row] * self.normals[:, None]).sum(-1)
+        near = np.where(along > 0, (1 - distance**2).clip(1e-9), 0.0)  # 0 where the set of neighbours changes
+        same_face = along > SAME_FACE
+        weight = np.where((same_face.sum(1) >= MIN_ON_FACE)[:, None], near * same_face, near)
+        around = self.points[row]
+        for _ in range(FITS):
+            middle, normals = _planes(around, weight)
+            height = ((around - middle[:, None]) * normals[:, None]).sum(-1)
+            spread = np.sqrt((weight * height**2).sum(1) / weight.sum(1)).clip(FLATNESS * self.spacing)
+            weight = near * np.exp(-((height / spread[:, None]) ** 2))
         normals *= np.where((normals * self.normals).sum(1, keepdims=True) < 0, -1, 1)
-        good = ((weight.sum(1) >= MIN_ON_FACE) & ((normals * self.normals).sum(1) > SAME_FACE))[:, None]
-        moved = self.points + ((middle - self.points) * normals).sum(1, keepdims=True) * normals
-        out.points, out.normals = np.where(good, moved, self.points), np.where(good, normals, self.normals)
+        out.points = self.points + ((middle - self.points) * normals).sum(1, keepdims=True) * normals
+        out.normals = normals
         out._tree = cKDTree(out.points)
         return out
 
@@ -108,41 +120,67 @@ class SolidSurface:
         """Centres (k, 3) of the voxels at more than this depth."""
         return self.voxels[self._coarse_depth(self.voxels) > depth]
 
-    def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centres (m, 3) of the voxels in and around the body, their depths (m,), and which (m,) make up the body.
+    def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres (m, 3) of the voxels in and around the body, their depths (m,), which (m,) make up the body, and the
+        filled share (m,) of each.
 
         Those are the ones inside, and in sheets thinner than a voxel those of the coarse body.
         """
         near = surrounded(self._full)
-        x = (np.argwhere(near) + self._low + 0.5) * self.h
+        x = self._centres(near)
         depth = self._depth_grid[near]
         inside = near & (self._depth_grid >= 0)
         inside |= self._full & ~surrounded(inside)
-        return x, depth, inside[near]
+        share = (depth > 0).astype(float)
+        cut = np.flatnonzero(np.abs(depth) < self.h)
+        octants = x[cut, None] + self.h / 4 * OCTANTS
+        share[cut] = (
+            (2 * self._at(self._depth_grid, octants.reshape(-1, 3)) / self.h + 0.5).clip(0, 1).reshape(-1, 8).mean(1)
+        )
+        return x, depth, inside[near], share
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Points (s, 3) on the surface, one in each voxel that has any, and normals (s, 3), outwards."""
-        cells = np.floor(self.points / self.h).astype(np.int64) - self._low
-        _, first = np.unique(np.ravel_multi_index(tuple(cells.T), self._full.shape), return_index=True)
-        points, normals = self.points[first], self.normals[first]
+        rows = self.thinned()
+        points, normals = self.points[rows], self.normals[rows]
         return points + self.depth(points)[:, None] * normals, normals
+
+    def thinned(self) -> np.ndarray:
+        """Rows (s,) of the first of the points in each voxel that has any."""
+        index = np.ravel_multi_index(tuple(self._cells(self.points).T), self._full.shape)
+        return np.unique(index, return_index=True)[1]
 
     def depth_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Depths (x, y, z) below the surface at the centres of voxels in and around the body; the first centre."""
-        return self._depth_grid, (self._low + 0.5) * self.h
+        return self._depth_grid, self._first
 
     @cached_property
     def _depth_grid(self) -> np.ndarray:
         out = self._depth.copy()
         close = np.abs(out) < 2 * self.h
-        out[close] = self._fine_depth((np.argwhere(close) + self._low + 0.5) * self.h, out[close])
+        out[close] = self._fine_depth(self._centres(close), out[close])
         return out
 
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
         return self._at(self._depth, x)
 
     def _at(self, grid: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return ndimage.map_coordinates(grid, (x / self.h - self._low - 0.5).T, order=1, mode="nearest")
+        return ndimage.map_coordinates(grid, ((x - self._first) / self.h).T, order=1, mode="nearest")
+
+    def _cells(self, x: np.ndarray) -> np.ndarray:
+        """Indices (k, 3) of the voxels that contain points (k, 3)."""
+        return np.floor((x - self._first) / self.h + 0.5).astype(np.int64)
+
+    def _centres(self, mask: np.ndarray) -> np.ndarray:
+        """Centres (k, 3) of the voxels of a mask of the grid."""
+        return self._first + self.h * np.argwhere(mask)
+
+
+def _planes(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point (n, 3) on the plane that fits each row of points (n, k, 3) with weights (n, k), and its normal (n, 3)."""
+    middle = (weight[..., None] * points).sum(1) / weight.sum(1, keepdims=True)
+    arm = (points - middle[:, None]) * np.sqrt(weight)[..., None]
+    return middle, np.linalg.eigh(np.einsum("nka,nkb->nab", arm, arm))[1][:, :, 0]
 
 
 @cached_in_scene
@@ -151,28 +189,32 @@ def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
     voxels, h = filled_voxels(scene, object_id, _voxels_along(scene, object_id), seed)
     means = usable_means(scene, object_id)
     means = means[inliers(means)] if len(means) else means
-    return SolidSurface(voxels.double().numpy(), h, means.double().numpy())
+    return SolidSurface(voxels.numpy(), h, means.double().numpy())
 
 
 def _voxels_along(scene: Scene, object_id: int) -> int:
-    """Number of voxels along an object: more where it is larger than the others and its Gaussians are as dense."""
-    own, sizes = _means(scene, object_id), _sizes(scene)
+    """Number of voxels along an object, which has about VOXELS_ALONG^3 in its bounding box: more along a flat or long
+    one, and along one that is larger than the others and has Gaussians as dense.
+    """
+    own, sides = _means(scene, object_id), _sides(scene)
     some = own[:: -(-max(len(own), 1) // 2000)]
     spacing = float(np.median(cKDTree(own).query(some, 2)[0][:, 1])) if len(own) > 1 else np.inf
-    most = min(MOST_ALONG, sizes[object_id] / max(spacing, 1e-12))
-    ratio = sizes[object_id] / float(np.median(list(sizes.values())))
-    return round(max(VOXELS_ALONG, min(VOXELS_ALONG * ratio, most)))
+    longest = {i: s.max() for i, s in sides.items()}
+    mine = longest[object_id]
+    usual = VOXELS_ALONG * mine / sides[object_id].clip(mine / SLENDER).prod() ** (1 / 3)
+    larger = min(VOXELS_ALONG * mine / float(np.median(list(longest.values()))), MOST_ALONG)
+    return round(max(VOXELS_ALONG, min(max(usual, larger), mine / max(spacing, 1e-12))))
 
 
 @cached_in_scene
-def _sizes(scene: Scene) -> dict[int, float]:
-    """Longest side of each object without outliers, by its id."""
-    sizes = {}
+def _sides(scene: Scene) -> dict[int, np.ndarray]:
+    """Sides (3,) of the bounding box of each object without outliers, by its id."""
+    sides = {}
     for o in scene.objects:
         means = _means(scene, o.id)
         ends = np.quantile(means, [0.99, 0.01], axis=0) if len(means) else np.zeros((2, 3))
-        sizes[o.id] = max(float((ends[0] - ends[1]).max()), 1e-12)
-    return sizes
+        sides[o.id] = (ends[0] - ends[1]).clip(1e-12)
+    return sides
 
 
 def _means(scene: Scene, object_id: int) -> np.ndarray:

@@ -11,14 +11,13 @@ kernels = pytest.mark.skipif(not compiles_for_cpu(), reason="Warp has no compile
 
 
 def scene(count: int):
-    """Grids of three bodies at random poses, and points with normals that are looked up from body a in body b."""
+    """Grids of three bodies at random poses, and points that are looked up from body a in body b."""
     rng = np.random.default_rng(count)
     shapes = [(5, 6, 7), (4, 3, 9), (8, 8, 2)]
     grids = [rng.normal(size=shape) for shape in shapes], rng.uniform(-0.6, -0.2, (3, 3)), np.array([0.1, 0.15, 0.12])
     poses = Rotation.random(3, random_state=count).as_matrix(), rng.normal(size=(3, 3)) * 0.1
     a, b = rng.integers(0, 3, (2, count))
-    points, normals = rng.normal(size=(2, count, 3))
-    return grids, poses, 0.3 * points, normals / np.linalg.norm(normals, axis=1, keepdims=True), a, b
+    return grids, poses, 0.3 * rng.normal(size=(count, 3)), a, b
 
 
 @kernels
@@ -27,10 +26,10 @@ def test_kernels_agree_with_numpy(counts):
     grids, *_ = scene(1)
     compiled, numpy = CompiledDepthLookup(*grids), DepthLookup(*grids)
     for count in counts:
-        _, poses, points, normals, a, b = scene(count)
+        _, poses, points, a, b = scene(count)
         distance = numpy.distances(points, a, b, *poses)
         np.testing.assert_allclose(compiled.distances(points, a, b, *poses), distance, atol=1e-12)
-        found, wanted = (x.contacts(points, normals, a, b, *poses) for x in (compiled, numpy))
+        found, wanted = (x.inside(points, a, b, *poses) for x in (compiled, numpy))
         assert len(wanted[0]) >= count // 50  # some are inside
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-10)
@@ -50,13 +49,12 @@ def test_distances_and_contacts_of_a_ball(make):
     distance = lookup.distances(points, zeros, ones, turn, at)
     assert distance[0] == pytest.approx(-0.1, abs=2e-3)
     assert 0.3 < distance[1] <= 0.5 and 5.7 < distance[2] <= 6  # bounds for points outside of the grid
-    towards = np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 1]])
-    rows, place, normal, depth = lookup.contacts(points, towards, zeros, ones, turn, at)
+    rows, place, outwards, depth, node = lookup.inside(points, zeros, ones, turn, at)
     assert rows.tolist() == [0] and depth == pytest.approx([0.1], abs=2e-3)
     np.testing.assert_allclose(place, [[1.1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(normal, [[-1, 0, 0]], atol=0.03)  # half a cell over the radius: the point is on a node
-    away = lookup.contacts(points, -towards, zeros, ones, turn, at)
-    assert away[0].tolist() == [0] and away[3].tolist() == [0]  # surfaces that do not face each other do not touch
+    np.testing.assert_allclose(outwards, [[-1, 0, 0]], atol=0.03)  # half a cell over the radius: the point is on a node
+    nearest = x.reshape(-1, 3)[node[0] - ball.size]  # the second grid follows the first
+    np.testing.assert_allclose(nearest, [-0.9, 0, 0], atol=0.026)
 
 
 def test_gradient_of_the_interpolation():

@@ -21,8 +21,10 @@ DIAGONAL = wp.constant(0.70710678)
 GAP_WEIGHT = wp.constant(10.0)  # of a gap against the distance along a direction
 MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the way of a step [m]; a tenth of an object
 # Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
-# Larger for points on a face: otherwise an edge that passes over them gives contacts with oblique normals.
-MIN_FACING, MIN_FACING_OF_FACE = wp.constant(0.3), wp.constant(0.9)
+MIN_FACING = wp.constant(0.3)
+OPPOSED = wp.constant(0.9)  # least cosine of the angle at which two faces are parallel, at the edges of both
+CURVED = wp.constant(5.0e-4)  # difference of flatness that counts: a plane has 1, a ball of 2000 points .998
+FACES = wp.constant(3)  # at a point of a surface
 STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
 CLOSEST_POINT_STEPS = wp.constant(3)  # to the point of a ball that is nearest to a surface
 
@@ -41,7 +43,10 @@ class SurfaceArrays:
     near: wp.array2d[int]
     samples: wp.array2d[wp.vec3]
     normals: wp.array2d[wp.vec3]
-    flat: wp.array2d[wp.bool]
+    point: wp.array2d[int]
+    flatness: wp.array[float]
+    faces: wp.array2d[wp.vec3]
+    nearest: wp.array[int]
     centre: wp.array[wp.vec3]
     radius: wp.array[float]
     reach: wp.array[float]
@@ -140,14 +145,14 @@ def _beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
 
 
 @wp.func
-def nearest_keypoint(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
-    """The keypoint near x in the frame of a body."""
+def _nearest_node(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
+    """The row of the node nearest to x in the frame of a body."""
     n = s.shape[body]
     place = (x - s.low[body]) / s.spacing[body]
     i = wp.clamp(int(wp.round(place[0])), 0, n[0] - 1)
     j = wp.clamp(int(wp.round(place[1])), 0, n[1] - 1)
     k = wp.clamp(int(wp.round(place[2])), 0, n[2] - 1)
-    return s.keypoint[_node(s, body, i, j, k)]
+    return _node(s, body, i, j, k)
 
 
 @wp.func
@@ -196,7 +201,25 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
     out.gap = s.overlap[a, b] - found[3]
     own = poses.R[scene, a] * s.normals[a, q]
     out.facing = -wp.dot(own, out.normal) > MIN_FACING
-    if s.flat[a, q]:  # under an edge of b, whose own normal is oblique
+    # Where b has an edge its depths increase in an oblique direction. The normal is that of a face: of faces that are
+    # parallel the one of the flatter surface, else that of a if its sample is on one.
+    p = s.point[a, q]
+    r = s.nearest[_nearest_node(s, b, x)]
+    most = float(-1.0)
+    opposite = wp.vec3()
+    if r >= 0:
+        to_b = wp.transpose(R) * poses.R[scene, a]
+        for i in range(FACES):
+            for j in range(FACES):
+                facing = -wp.dot(to_b * s.faces[p, i], s.faces[r, j])
+                if facing > most and wp.length_sq(s.faces[p, i]) > 0.0 and wp.length_sq(s.faces[r, j]) > 0.0:
+                    most = facing
+                    opposite = s.faces[r, j]
+        if most > -1.0:
+            out.facing = most > MIN_FACING
+    if most > OPPOSED and (s.flatness[p] == 0.0 or s.flatness[r] > s.flatness[p] + CURVED):
+        out.normal = R * opposite
+    elif s.flatness[p] > 0.0:
         out.normal = -own
     return out
 
@@ -292,7 +315,7 @@ def _look_at(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair:
         if point.gap < margin and point.facing:
             found.gap[scene, pair, q] = point.gap
             found.side[scene, pair, q] = wp.int8(_side_of(point.normal))
-            found.other[scene, pair, q] = nearest_keypoint(s, b, x)
+            found.other[scene, pair, q] = s.keypoint[_nearest_node(s, b, x)]
 
 
 @wp.func

@@ -12,12 +12,10 @@ from dataclasses import dataclass, fields, replace
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-NEIGHBOURS = 6  # samples, with itself, whose normals decide whether one is on a face
-FACE_COSINE = 0.97  # least length of the mean of their normals, .71 at a cube's edges and .58 at its corners
 CORNERS = torch.tensor(list(product((0, 1), repeat=3)))  # of a cell
 
 
@@ -33,6 +31,10 @@ class BodyGrid:
     samples: Float[Tensor, "k 3"]  # points on the surface in the body's frame
     normals: Float[Tensor, "k 3"]  # there, outwards
     near: Int[Tensor, "k"]  # keypoint near each
+    point: Int[Tensor, "k"]  # which of the following points each is
+    flatness: Float[Tensor, "p"]  # of the surface at points: 1 in a plane and 0 at an edge
+    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
+    nearest: Int[Tensor, "x y z"]  # point nearest to each node; -1 far from the surface
     ball: tuple[Float[Tensor, "3"], float] | None = None  # its centre and radius, if the body is one
 
 
@@ -50,7 +52,10 @@ class BodySurfaces:
     near: Int[Tensor, "o k"]  # keypoint near each sample; -1 where padded
     samples: Float[Tensor, "o k 3"]  # points on the surface in the body's frame [m]
     normals: Float[Tensor, "o k 3"]  # outwards
-    flat: Bool[Tensor, "o k"]  # on a face
+    point: Int[Tensor, "o k"]  # which of the following points each is
+    flatness: Float[Tensor, "p"]  # of the surfaces at points: 1 in a plane and 0 at an edge
+    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
+    nearest: Int[Tensor, "g"]  # point nearest to each node; -1 far from the surface
     centre: Float[Tensor, "o 3"]  # of a ball
     radius: Float[Tensor, "o"]  # of a ball; 0 for other bodies
     reach: Float[Tensor, "o"]  # of the samples about the centre of mass [m]
@@ -61,16 +66,21 @@ class BodySurfaces:
         """The surfaces of bodies; without overlaps."""
         sizes = torch.tensor([g.depth.numel() for g in grids])
         flat = {n: torch.cat([getattr(g, n).flatten() for g in grids]) for n in ("depth", "smooth", "keypoint")}
-        at, normals, near = (
+        at, normals, near, point = (
             pad_sequence([getattr(g, n) for g in grids], batch_first=True, padding_value=padding)
-            for n, padding in (("samples", 0.0), ("normals", 0.0), ("near", -1))
+            for n, padding in (("samples", 0.0), ("normals", 0.0), ("near", -1), ("point", 0))
         )
+        points = torch.tensor([len(g.faces) for g in grids])
+        first = points.cumsum(0) - points
+        nearest = [torch.where(g.nearest < 0, -1, first[i] + g.nearest).flatten() for i, g in enumerate(grids)]
         none = at.new_zeros(3), 0.0
         balls = [none if g.ball is None else g.ball for g in grids]
         return cls(
             **flat, first=sizes.cumsum(0) - sizes, shape=torch.tensor([g.depth.shape for g in grids]),
             low=torch.stack([g.low for g in grids]), spacing=at.new_tensor([g.spacing for g in grids]),
-            near=near, samples=at, normals=normals, flat=_flat(at, normals, near >= 0),
+            near=near, samples=at, normals=normals, point=first[:, None] + point,
+            flatness=torch.cat([g.flatness for g in grids]), faces=torch.cat([g.faces for g in grids]),
+            nearest=torch.cat(nearest),
             centre=torch.stack([centre for centre, _ in balls]), radius=at.new_tensor([radius for _, radius in balls]),
             reach=at.norm(dim=-1).amax(-1), overlap=at.new_zeros(len(grids), len(grids)),
         )  # fmt: skip
@@ -108,13 +118,3 @@ class BodySurfaces:
     def _row(self, body: Tensor, node: Tensor) -> Tensor:
         shape = self.shape[body]
         return self.first[body] + (node[..., 0] * shape[..., 1] + node[..., 1]) * shape[..., 2] + node[..., 2]
-
-
-def _flat(
-    at: Float[Tensor, "o k 3"], normals: Float[Tensor, "o k 3"], real: Bool[Tensor, "o k"]
-) -> Bool[Tensor, "o k"]:
-    """Which samples are on a face, by the normals around them."""
-    distance = torch.cdist(at, at).masked_fill(~real[:, None], torch.inf)
-    near = distance.topk(min(NEIGHBOURS, at.shape[1]), largest=False).indices
-    body = torch.arange(len(at))[:, None, None]
-    return normals[body, near].mean(2).norm(dim=-1) > FACE_COSINE

@@ -18,6 +18,7 @@ from stages.core.scene.scene import Scene
 
 MIN_FRACTION = 0.1  # filled fraction of a voxel below which it has no particle
 THICK = 0.75  # depth of the middle of what is thicker than sheets, which are thickened to three voxels [voxels]
+SHEET = 2.5  # depth of the middle of thickened sheets, at most [voxels of the surface]
 
 
 def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: int = 0) -> Bodies:
@@ -52,7 +53,7 @@ def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface
     near = surrounded(body, refinement)
     depth = np.full(body.shape, -np.inf)
     depth[near] = surface.depth((np.argwhere(near) + low + 0.5) * h) / h
-    thick = surrounded(depth > THICK * refinement, 2 + refinement)
+    thick = surrounded(depth > max(THICK * refinement, SHEET * surface.h / h), 2 + refinement)
     fraction = np.where(thick, (depth + 0.5).clip(0, 1), body)
     fraction[fraction < MIN_FRACTION] = 0
     cells = np.argwhere(fraction)

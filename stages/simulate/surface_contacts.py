@@ -1,9 +1,10 @@
 """Contacts between the surfaces of rigid bodies, of which convex parts are only an approximation.
 
-The faces of convex parts lie at the mean level of the surface under them. What a rough surface has above it would enter
-other bodies, by up to a voxel of the rougher one: much of the height of a small body on a large one. So samples of each
-body's surface are looked up in the signed distance of the others, and those inside are contacts along its gradient,
-besides the contacts of the parts; so are those beyond the floor and walls. Bodies that fill their convex hull need none
+The faces of convex parts lie at the mean level of the surface under them, with small steps between them, over which a
+sliding body would stumble. So where one of two bodies has several parts, samples of each surface are looked up in the
+signed distance of the other one, and those inside are contacts, with the normals of the faces that meet
+(`surface_faces.py`); contacts of the parts are excluded. The samples that span the contact of a pair take part.
+What a rough surface has beyond its parts also touches the floor and walls. Bodies that fill their convex hull need none
 with each other and with planes.
 
 These contacts are inelastic: critically damped, and pushed apart at no more than the speed at which contacts do not
@@ -12,9 +13,7 @@ start is no contact, nor the least one since (`initial_overlaps.py`).
 
 Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
 distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
-that are far away none is looked at. Of the contacts between parts of two bodies, of which many meet where their
-surfaces do, only the deepest takes part of those that are close together and of about one direction; the others would
-only share its force.
+that are far away none is looked at.
 Sources: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
 contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 """
@@ -40,7 +39,6 @@ MARGIN = 0.05  # distance up to which samples are in a list [units of the simula
 BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
 BALL_NODES = 20  # along its radius: depths between them are interpolated to .001 radii
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
-CELLS = 2 * GROUPS_ALONG  # cells of that size on each side of a body's centre of mass
 STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
 NONE = np.zeros(0, np.int64), np.zeros(0)
 
@@ -123,8 +121,6 @@ class SurfaceContacts:
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
         self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # -1: fixed
         self._rough = np.append(rough, False)
-        self._edge = np.append([np.ptp(s.points, axis=0).max(initial=0) / GROUPS_ALONG for s in shapes], np.inf)
-        self._keys = (count + 1, count + 1, 2 * CELLS, 2 * CELLS, 2 * CELLS, 6)  # of contacts in `thin`
         self._dof = model.body_dofadr[1 : count + 1]
         self._path = np.zeros(count)  # the way that any point of a body has gone at most
         self._due = np.full((count, count), -np.inf)  # sum of both paths at which the list of a pair must be made again

@@ -20,7 +20,7 @@ from torch import Tensor
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Trajectory
-from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
+from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 
 G = 9.81
 POINTS_ALONG = 28  # Gaussians along the side of a cube
@@ -80,8 +80,8 @@ class Experiment:
 @cache
 def experiments() -> Mapping[str, Experiment]:
     """All experiments by name."""
-    groups = (_slides, _slopes, _rolls, _rocking, _creep, _falls, _torques, _towers, _invariance, _collisions,
-              _rebounds, _bounces, _stacks, _piles, _boxes)  # fmt: skip
+    groups = (_slides, _compound_slides, _slopes, _rolls, _rocking, _creep, _falls, _torques, _towers, _invariance,
+              _collisions, _rebounds, _bounces, _stacks, _piles, _boxes)  # fmt: skip
     return MappingProxyType({e.name: e for group in groups for e in group()})
 
 
@@ -200,6 +200,47 @@ def _slides() -> Iterator[Experiment]:
         value = 1 / (2 * mu * G)
         yield Experiment(f"slide/soft friction={mu:g}", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
                          "distance from 1 m/s [m]", value, SLIDES)  # fmt: skip
+
+
+def _compound_slides() -> Iterator[Experiment]:
+    """Bodies of several boxes that start at 1 m/s along x on others of several boxes, which do not move."""
+    stool = compound(0.008, ((0.3, 0.3, 0.04), (0, 0, 0.18)),
+                     *(((0.04, 0.04, 0.16), (x, y, 0.08)) for x, y in product((-0.13, 0.13), repeat=2)))  # fmt: skip
+    bridge = compound(0.01, ((0.3, 0.1, 0.04), (0, 0, 0.14)), ((0.04, 0.1, 0.12), (-0.13, 0, 0.06)),
+                      ((0.04, 0.1, 0.12), (0.13, 0, 0.06)))  # fmt: skip
+    tee = compound(0.01, ((0.24, 0.08, 0.05), (0, 0, 0.025)), ((0.06, 0.06, 0.14), (0, 0, 0.12)))
+    shelf = compound(0.012, ((1.0, 0.4, 0.03), (0, 0, -0.015)), ((0.03, 0.4, 0.3), (-0.485, 0, -0.18)),
+                     ((0.03, 0.4, 0.3), (0.485, 0, -0.18)))  # fmt: skip
+    rail = compound(0.01, ((1.2, 0.2, 0.03), (0, 0, -0.015)), ((0.04, 0.2, 0.1), (-0.58, 0, 0.02)))
+    pairs = {
+        "stool on shelf": (stool, shelf, 0),
+        "bridge on shelf": (bridge, shelf, 30),
+        "tee on rail": (tee, rail, 10),
+    }
+    for (name, (above, below, degrees)), mu in product(pairs.items(), (0.2, 0.6)):
+        bodies = below.moved((0, 0, 0.4)), about_z(above, degrees).moved((-0.3, 0, 0.4))
+        value = 1 / (2 * mu * G)
+        run = Run(tuple(map(Specimen, bodies)), {"pin": ("1",), "velocity": ("object=2 1,0,0",), "friction": mu,
+                                                 "steps": 10 + math.ceil(1 / (mu * G * 0.02))})  # fmt: skip
+        yield Experiment(f"slide/{name} friction={mu:g}", (run,), lambda t: float(path(t, 1)[-1, 0]), value,
+                         "distance from 1 m/s [m]", value, SLIDES)  # fmt: skip
+
+
+def compound(spacing: float, *boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Surface:
+    """The union of upright boxes of these sides and centres [m]."""
+
+    def part(sides: tuple[float, float, float], centre: tuple[float, float, float]):
+        half = torch.tensor(sides) / 2 - 1e-4
+        return box(sides, spacing).moved(centre), lambda p: ((p - torch.tensor(centre)).abs() < half).all(1)
+
+    return union(*(part(*each) for each in boxes))
+
+
+def about_z(surface: Surface, degrees: float) -> Surface:
+    """Turned about the z axis."""
+    a = math.radians(degrees)
+    R = torch.tensor([[math.cos(a), -math.sin(a), 0.0], [math.sin(a), math.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    return Surface(surface.points @ R.mT, surface.normals @ R.mT)
 
 
 def _slopes() -> Iterator[Experiment]:

@@ -214,7 +214,7 @@ def _compound_slides() -> Iterator[Experiment]:
     rail = compound(0.01, ((1.2, 0.2, 0.03), (0, 0, -0.015)), ((0.04, 0.2, 0.1), (-0.58, 0, 0.02)))
     pairs = {
         "stool on shelf": (stool, shelf, 0),
-        "bridge on shelf": (bridge, shelf, 30),
+        "bridge on shelf": (bridge, shelf, 5),
         "tee on rail": (tee, rail, 10),
     }
     for (name, (above, below, degrees)), mu in product(pairs.items(), (0.2, 0.6)):

@@ -6,25 +6,14 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ngff_cli.options import (
-    QUALITY_HELP,
-    AsJson,
-    CommandGroup,
-    Device,
-    SceneIn,
-    Seed,
-    Threads,
-    limit_threads,
-    run_command_line,
-    set_up_logging,
-)
+from ngff_cli.options import QUALITY_HELP, AsJson, Device, SceneIn, Seed, Threads, new_app, run_command_line, set_up
 from ngff_cli.scene_commands import reconstruct, refine, segment
 from stages.core.backends import load
 from stages.evaluate.options import EvaluateOptions
 from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
 from stages.simulate.options import DEFAULT_KEYPOINTS, ENGINE_HELP, LIVE_KEYPOINTS, SimulateOptions
 
-app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 def _version(wanted: bool) -> None:
@@ -45,8 +34,7 @@ def ngff(
 
     ngff reconstruct photos/ -o scene.ply; ngff simulate scene.ply -o traj.h5; ngff render traj.h5
     """
-    set_up_logging(verbose)
-    limit_threads(threads)
+    set_up(threads, verbose)
 
 
 for _command in (reconstruct, segment, refine):

@@ -4,13 +4,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
-from ngff_cli.options import AsJson, CommandGroup, Device, Seed, print_results
+from ngff_cli.options import AsJson, Device, Seed, new_app, print_results
 from stages.core.errors import InputError
 
-app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None)
+app = new_app()
 
 Out = Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")]
 OutKept = Annotated[Path, Option("-o", "--out", help="JSON file of results; existing ones are kept")]

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 from typer import Argument, Option
+from typer.models import OptionInfo
 
 from ngff_cli.options import AsJson, Device, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
@@ -18,6 +19,12 @@ ParticleSpacing = Annotated[float, Option(help="spacing of particles on a surfac
 Substep = Annotated[
     float, Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
 ]
+
+
+def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
+    """The option --from of a command, which says what its meshes are for and of what kind they are."""
+    help_text = f"{kind} (.obj .glb .ply ...), or folder of meshes, {use}; repeatable"
+    return Option("--from", metavar="MESH", help=help_text)
 
 
 @app.command()
@@ -155,14 +162,7 @@ def objects(
     only: Annotated[
         str, Option(help="names of the objects, such as ball,duck; default: all ten")
     ] = ObjectsOptions.only,
-    meshes: Annotated[
-        list[Path],
-        Option(
-            "--from",
-            metavar="MESH",
-            help="textured mesh (.obj .glb .ply ...), or folder of meshes, to convert instead; repeatable",
-        ),
-    ] = [],  # noqa: B006
+    meshes: Annotated[list[Path], meshes_option("to convert instead", "textured mesh")] = [],  # noqa: B006
     count: Annotated[int, Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
     up: Annotated[str, Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
     light: Annotated[bool, Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
@@ -191,14 +191,7 @@ def backgrounds(
 @app.command()
 def heldout(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
-    meshes: Annotated[
-        list[Path],
-        Option(
-            "--from",
-            metavar="MESH",
-            help="mesh (.obj .glb .ply ...), or folder of meshes, that replaces the eight shapes; repeatable",
-        ),
-    ] = [],  # noqa: B006
+    meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
     scenes: Annotated[int, Option(help="number of scenes")] = 100,
     objects: Annotated[int, Option(help="objects per scene")] = 3,
     frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
@@ -229,14 +222,7 @@ def heldout(
 @app.command()
 def clutter(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
-    meshes: Annotated[
-        list[Path],
-        Option(
-            "--from",
-            metavar="MESH",
-            help="textured mesh (.obj .glb .ply ...), or folder of meshes, added to the generated objects; repeatable",
-        ),
-    ] = [],  # noqa: B006
+    meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
     count: Annotated[int, Option(help="number of scenes")] = 20,
     first: Annotated[int, Option(help="number of the first scene")] = 0,
     photos: Annotated[int, Option(help="photos of each scene")] = 12,

@@ -4,34 +4,23 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from ngff_cli import bench, data, training
-from ngff_cli.options import (
-    AsJson,
-    CommandGroup,
-    Device,
-    SceneIn,
-    Seed,
-    Threads,
-    limit_threads,
-    print_results,
-    run_command_line,
-    set_up_logging,
-)
+from ngff_cli.options import AsJson, Device, SceneIn, Seed, Threads, new_app, print_results, run_command_line, set_up
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
 from stages.lab.track.options import TrackOptions
 
-app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
+
+MaterialsOut = Annotated[Path, Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")]
 
 
 @app.callback()
 def lab(threads: Threads = None) -> None:
     """Generate data, train models, run benchmarks, and check the installation."""
-    set_up_logging(False)
-    limit_threads(threads)
+    set_up(threads)
 
 
 @app.command()
@@ -73,9 +62,7 @@ def fuzz(
 @app.command("estimate-materials")
 def estimate_materials(
     video: Annotated[Path, Argument(metavar="VIDEO.mp4", help="video of moving objects")],
-    out: Annotated[
-        Path, Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
-    ] = Path("materials.json"),
+    out: MaterialsOut = Path("materials.json"),
     objects: Annotated[
         str, Option(help="names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
     ] = "",
@@ -103,9 +90,7 @@ def fit(
             "the first frame is the scene",
         ),
     ],
-    out: Annotated[
-        Path, Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
-    ] = Path("materials.json"),
+    out: MaterialsOut = Path("materials.json"),
     engine: Annotated[str, Option(help="engine that simulates the candidates: auto | rigid | mpm | ngff")] = "auto",
     quality: Annotated[str, Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
     material: Annotated[

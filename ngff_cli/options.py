@@ -34,19 +34,6 @@ NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new th
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
 
 
-def limit_threads(count: int | None) -> None:
-    """Use at most `count` CPU threads in PyTorch, OpenMP and our own kernels; None keeps their defaults.
-
-    They read these variables when they are first imported, which no command has done yet.
-    """
-    if count is None:
-        return
-    if count < 1:
-        raise InputError(f"--threads {count}: give 1 or more")
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(count)
-
-
 class StderrHandler(logging.Handler):
     """Writes to the current sys.stderr, which may have been replaced since the handler was installed."""
 
@@ -93,8 +80,12 @@ def interrupt(number: int, frame) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.01)
 
 
-def set_up_logging(verbose: bool) -> None:
-    """Send log messages to stderr; stdout is reserved for results. `verbose` includes debug messages."""
+def set_up(threads: int | None, verbose: bool = False) -> None:
+    """Send log messages, with `verbose` also for debugging, to stderr; use at most `threads` CPU threads, None: all.
+
+    PyTorch, OpenMP and our own kernels read the number when they are first imported, which no command has done yet.
+    Raises InputError if it is below 1.
+    """
     if hasattr(sys.stdout, "reconfigure"):  # paths that are not UTF-8 are printed as they are
         sys.stdout.reconfigure(errors="surrogateescape")
     if not sys.stderr.isatty():  # in a log file a progress line every 10 s is enough
@@ -102,6 +93,17 @@ def set_up_logging(verbose: bool) -> None:
     logging.basicConfig(handlers=[StderrHandler()], format="%(message)s", level=logging.WARNING, force=True)
     for name in ("stages", "ngff_cli"):
         logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)
+    if threads is None:
+        return
+    if threads < 1:
+        raise InputError(f"--threads {threads}: give 1 or more")
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+
+
+def new_app() -> typer.Typer:
+    """A command line, or a group of its commands; see CommandGroup."""
+    return typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None, as_json: bool) -> None:

@@ -17,11 +17,7 @@ from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET, find, gaussi
 from stages.core.scene.files import sha256
 from tests.core.models.diffsplat.tiny_model import autoencoder, unet
 
-
-@pytest.fixture(autouse=True)
-def empty_weight_folders(monkeypatch, tmp_path):
-    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("empty_weight_folders")
 
 
 @pytest.fixture

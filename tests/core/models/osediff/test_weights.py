@@ -11,11 +11,7 @@ from stages.core.errors import InputError
 from stages.core.models.osediff.weights import BASE, LORA, find, load, merge_lora, read_lora
 from tests.core.models.osediff.tiny_model import lora_file, unet
 
-
-@pytest.fixture(autouse=True)
-def empty_weight_folders(monkeypatch, tmp_path):
-    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("empty_weight_folders")
 
 
 @pytest.fixture

@@ -17,11 +17,7 @@ from stages.core.scene.files import sha256
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 from tests.core.models.pi3.test_splat import TINY_SPLAT
 
-
-@pytest.fixture(autouse=True)
-def empty_weight_folders(monkeypatch, tmp_path):
-    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("empty_weight_folders")
 
 
 @torch.no_grad()

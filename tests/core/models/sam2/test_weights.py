@@ -14,11 +14,7 @@ from stages.core.models.sam2.weights import download, find, load
 from stages.core.scene.files import sha256
 from tests.core.models.sam2.tiny_model import random_model, save_tiny_model
 
-
-@pytest.fixture(autouse=True)
-def empty_weight_folders(monkeypatch, tmp_path):
-    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("empty_weight_folders")
 
 
 def test_weight_search_order(tmp_path):

@@ -2,6 +2,7 @@
 
 import signal
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,42 +19,42 @@ from tests.conftest import two_balls_scene
 from tests.limits import file_size_limit
 from tests.pipeline.test_commands import call
 
-pytestmark = pytest.mark.usefixtures("device")
+pytestmark = pytest.mark.usefixtures("device", "input_files")
 WRONG = [
-    ("reconstruct", "{}/absent", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/empty", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/text.h5", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/damaged", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/damaged", "-o", "{}/nowhere/o.ply"),
-    ("segment", "{}/absent.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/text.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/cut.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/empty", "-o", "{}/o.ply"),
-    ("segment", "{}/good.ply", "-o", "{}/nowhere/o.ply"),
-    ("refine", "{}/text.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/empty.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/cut.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/good.h5", "-o", "{}/o.ply"),
-    ("refine", "{}/good.ply", "-o", "{}/empty"),
-    ("simulate", "{}/text.ply", "-o", "{}/o.h5"),
-    ("simulate", "{}/cut.ply", "-o", "{}/o.h5"),
-    ("simulate", "{}/good.h5", "-o", "{}/o.h5"),
-    ("simulate", "{}/good.ply", "-o", "{}/nowhere/o.h5"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "magic"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--force", "nonsense"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--device", "abacus"),
-    ("render", "{}/absent.h5"),
-    ("render", "{}/text.h5"),
-    ("render", "{}/cut.h5"),
-    ("render", "{}/empty.h5"),
-    ("render", "{}/empty"),
-    ("render", "{}/good.ply", "-o", "{}/o.gif"),
-    ("render", "{}/good.ply", "-o", "{}/nowhere/o.png"),
-    ("evaluate", "{}/text.h5", "--against", "{}/text.h5"),
-    ("evaluate", "{}/good.h5", "--against", "{}/cut.h5"),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.ply"),
-    ("evaluate", "{}/good.ply", "--against", "{}/absent.ply"),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/nowhere/m.json"),
+    "reconstruct absent -o o.ply",
+    "reconstruct empty -o o.ply",
+    "reconstruct text.h5 -o o.ply",
+    "reconstruct damaged -o o.ply",
+    "reconstruct damaged -o nowhere/o.ply",
+    "segment absent.ply -o o.ply",
+    "segment text.ply -o o.ply",
+    "segment cut.ply -o o.ply",
+    "segment empty -o o.ply",
+    "segment good.ply -o nowhere/o.ply",
+    "refine text.ply -o o.ply",
+    "refine empty.ply -o o.ply",
+    "refine cut.ply -o o.ply",
+    "refine good.h5 -o o.ply",
+    "refine good.ply -o empty",
+    "simulate text.ply -o o.h5",
+    "simulate cut.ply -o o.h5",
+    "simulate good.h5 -o o.h5",
+    "simulate good.ply -o nowhere/o.h5",
+    "simulate good.ply -o o.h5 --engine magic",
+    "simulate good.ply -o o.h5 --force nonsense",
+    "simulate good.ply -o o.h5 --device abacus",
+    "render absent.h5",
+    "render text.h5",
+    "render cut.h5",
+    "render empty.h5",
+    "render empty",
+    "render good.ply -o o.gif",
+    "render good.ply -o nowhere/o.png",
+    "evaluate text.h5 --against text.h5",
+    "evaluate good.h5 --against cut.h5",
+    "evaluate good.h5 --against good.ply",
+    "evaluate good.ply --against absent.ply",
+    "evaluate good.h5 --against good.h5 -o nowhere/m.json",
 ]
 
 
@@ -63,7 +64,7 @@ def quick_segmentation(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def input_files(tmp_path_factory, device):
+def made_files(tmp_path_factory, device):
     """A valid scene and trajectory, and files that are absent, empty, truncated, or of another format."""
     folder = tmp_path_factory.mktemp("wrong")
     for name in ("empty", "damaged"):
@@ -82,20 +83,27 @@ def input_files(tmp_path_factory, device):
     return folder
 
 
-def fails_cleanly(folder, args, command=call, expected=2) -> str:
-    """Assert one line on stderr, the expected status, empty stdout and no new file; return the line."""
-    before = sorted(p.name for p in folder.iterdir())
-    status, out, err = command(*(str(a).format(folder) for a in args))
+@pytest.fixture
+def input_files(made_files, monkeypatch):
+    """The folder of these files, which is the working directory."""
+    monkeypatch.chdir(made_files)
+    return made_files
+
+
+def fails_cleanly(words: str, command=call, expected=2) -> str:
+    """Assert one line on stderr, the expected status, empty stdout and no new file; return the line on stderr."""
+    before = sorted(p.name for p in Path.cwd().iterdir())
+    status, out, err = command(*words.split())
     lines = [line for line in err.splitlines() if line.startswith("ngff: ")]
     assert status == expected and len(lines) == 1, err
     assert "Traceback" not in err and out == ""
-    assert sorted(p.name for p in folder.iterdir()) == before
+    assert sorted(p.name for p in Path.cwd().iterdir()) == before
     return lines[0]
 
 
-@pytest.mark.parametrize("args", WRONG, ids=lambda a: " ".join(a).replace("{}/", ""))
-def test_wrong_input_gives_one_line_and_status_2(input_files, args):
-    fails_cleanly(input_files, args)
+@pytest.mark.parametrize("line", WRONG)
+def test_wrong_input_gives_one_line_and_status_2(line):
+    fails_cleanly(line)
 
 
 def work(*_, **__):
@@ -112,53 +120,48 @@ def test_a_missing_folder_is_reported_before_the_work(input_files, stage, name, 
 
 
 FULL = [
-    ("segment", "{}/good.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/good.ply", "-o", "{}/o.ply"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--steps", 3, "--quality", "draft"),
-    ("render", "{}/good.h5", "-o", "{}/o.mp4", "--resolution", 64),
-    ("render", "{}/good.ply", "-o", "{}/o.png", "--resolution", 64),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/m.json"),
+    "segment good.ply -o o.ply",
+    "refine good.ply -o o.ply",
+    "simulate good.ply -o o.h5 --steps 3 --quality draft",
+    "render good.h5 -o o.mp4 --resolution 64",
+    "render good.ply -o o.png --resolution 64",
+    "evaluate good.h5 --against good.h5 -o m.json",
 ]
 
 
-@pytest.mark.parametrize("args", FULL, ids=lambda a: a[0] + a[3][-4:])
-def test_full_disk_gives_one_line_and_status_2(input_files, args):
+@pytest.mark.parametrize("line", FULL)
+def test_full_disk_gives_one_line_and_status_2(line):
     def limited(*args):
         with file_size_limit(600):
             return call(*args)
 
-    assert "cannot be written" in fails_cleanly(input_files, args, limited)
+    assert "cannot be written" in fails_cleanly(line, limited)
 
 
 EXHAUSTED = [
-    (("reconstruct", "{}/damaged", "-o", "{}/o.ply"), "photo_reader:_is_truncated", "--quality or --resolution"),
-    (("segment", "{}/good.ply", "-o", "{}/o.ply"), "stage:rename_objects", "--max-objects"),
-    (("refine", "{}/good.ply", "-o", "{}/o.ply"), "stage:fill_background", "--resolution"),
-    (
-        ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "ngff"),
-        "learned:TimeStepper",
-        "--quality or --keypoints",
-    ),
-    (("render", "{}/good.h5", "-o", "{}/o.mp4"), "draw:rasterise", "--resolution"),
+    ("reconstruct damaged -o o.ply", "photo_reader:_is_truncated", "--quality or --resolution"),
+    ("segment good.ply -o o.ply", "stage:rename_objects", "--max-objects"),
+    ("refine good.ply -o o.ply", "stage:fill_background", "--resolution"),
+    ("simulate good.ply -o o.h5 --engine ngff", "learned:TimeStepper", "--quality or --keypoints"),
+    ("render good.h5 -o o.mp4", "draw:rasterise", "--resolution"),
 ]
 
 
-@pytest.mark.parametrize(("args", "where", "options"), EXHAUSTED, ids=lambda a: a[0] if isinstance(a, tuple) else "")
-def test_gpu_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, args, where, options):
+@pytest.mark.parametrize(("line", "where", "options"), EXHAUSTED)
+def test_gpu_out_of_memory_gives_one_line_and_status_1(monkeypatch, line, where, options):
     def exhausted(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
     module, name = where.split(":")
-    monkeypatch.setattr(import_module(f"stages.{args[0]}.{module}"), name, exhausted)
-    line = fails_cleanly(input_files, args, expected=1)
-    assert "the GPU is out of memory" in line and f"lower {options}, use --device cpu" in line
+    monkeypatch.setattr(import_module(f"stages.{line.split()[0]}.{module}"), name, exhausted)
+    message = fails_cleanly(line, expected=1)
+    assert "the GPU is out of memory" in message and f"lower {options}, use --device cpu" in message
 
 
 @pytest.mark.parametrize("allocate", [torch.empty, np.empty], ids=["torch", "numpy"])
-def test_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, allocate):
+def test_out_of_memory_gives_one_line_and_status_1(monkeypatch, allocate):
     monkeypatch.setattr(import_module("stages.render.draw"), "rasterise", lambda *_, **__: allocate(1 << 50))
-    args = ("render", "{}/good.h5", "-o", "{}/o.mp4")
-    line = fails_cleanly(input_files, args, expected=1)
+    line = fails_cleanly("render good.h5 -o o.mp4", expected=1)
     assert line.endswith("the machine is out of memory: close other programs that use it, lower --resolution")
 
 
@@ -177,9 +180,9 @@ def test_out_of_memory_before_a_command_begins_gives_one_line(capsys):
     assert ended.value.code == 1 and line == "ngff: the machine is out of memory: close other programs that use it\n"
 
 
-def test_out_of_memory_while_a_file_is_read_is_not_reported_as_a_damaged_file(input_files, monkeypatch):
+def test_out_of_memory_while_a_file_is_read_is_not_reported_as_a_damaged_file(monkeypatch):
     monkeypatch.setattr(import_module("stages.core.scene.trajectory"), "_read", lambda *_: np.empty(1 << 50))
-    line = fails_cleanly(input_files, ("render", "{}/good.h5", "-o", "{}/o.mp4"), expected=1)
+    line = fails_cleanly("render good.h5 -o o.mp4", expected=1)
     assert "the machine is out of memory" in line and "good.h5" not in line
 
 

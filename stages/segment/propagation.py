@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.models.promptable import PointPrompts, PromptableSegmenter
+from stages.core.models.promptable import PromptableSegmenter, Prompts
 from stages.core.perception.voting import voting_intrinsics
 from stages.core.scene.scene import Scene
 from stages.segment.view_images import ViewImages
@@ -32,9 +32,7 @@ class MaskTracker:
         """Masks that the network proposes without prompts for image `row`."""
         return self.network.propose_masks(self.pixels(row))
 
-    def labels(
-        self, prompts: Sequence[PointPrompts] | Bool[Tensor, "o l l"], start: int = 0
-    ) -> Iterator[tuple[int, Int[Tensor, "h w"]]]:
+    def labels(self, prompts: Prompts, start: int = 0) -> Iterator[tuple[int, Int[Tensor, "h w"]]]:
         """Each camera with its label image (1... in the order of the prompts), at the resolution of voting.
 
         `start` is the row of the image that the prompts refer to.

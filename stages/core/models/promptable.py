@@ -35,6 +35,11 @@ class PointPrompts:
         return cls(point[None], torch.tensor([FOREGROUND_POINT]))
 
 
+Prompts = Sequence[PointPrompts] | Bool[Tensor, "o l l"]  # each marks one object, by points or by its mask
+FrameReader = Callable[[int], Float[Tensor, "3 s s"]]  # the network input of a frame
+MaskLogits = Iterator[tuple[int, Float[Tensor, "o l l"]]]  # a frame, and the logits of each object in it
+
+
 class PromptableSegmenter(Protocol):
     """A network that segments a photo from prompts and propagates masks through a sequence of photos.
 
@@ -49,15 +54,9 @@ class PromptableSegmenter(Protocol):
         """Masks of all regions of a photo, without prompts; they may overlap and include parts of objects."""
         ...
 
-    def propagate(
-        self,
-        frame: Callable[[int], Float[Tensor, "3 s s"]],
-        count: int,
-        prompts: Sequence[PointPrompts] | Bool[Tensor, "o l l"],
-        start: int = 0,
-    ) -> Iterator[tuple[int, Float[Tensor, "o l l"]]]:
+    def propagate(self, frame: FrameReader, count: int, prompts: Prompts, start: int = 0) -> MaskLogits:
         """Mask logits (positive inside) of all objects for each of `count` frames, in any order of frames.
 
-        `prompts` mark one object each in frame `start`; `frame` returns the network input of a frame.
+        `prompts` mark one object each in frame `start`.
         """
         ...

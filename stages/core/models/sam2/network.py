@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from transformers import Sam2VideoInferenceSession, Sam2VideoModel
 
-from stages.core.models.promptable import PointPrompts
+from stages.core.models.promptable import FrameReader, MaskLogits, PointPrompts, Prompts
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as published in preprocessor_config.json
 
@@ -30,7 +28,7 @@ def pixel_values(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s
 class StreamingSession(Sam2VideoInferenceSession):
     """Inference session that loads frames on demand and whose memory does not grow with their number."""
 
-    def __init__(self, frame: Callable[[int], Float[Tensor, "3 s s"]], count: int, device: torch.device):
+    def __init__(self, frame: FrameReader, count: int, device: torch.device):
         super().__init__(inference_device=device, inference_state_device=device, dtype=torch.float32)
         self._frame, self._count = frame, count
 
@@ -65,12 +63,8 @@ class StreamingSession(Sam2VideoInferenceSession):
 
 
 def propagate_masks(
-    model: Sam2VideoModel,
-    frame: Callable[[int], Float[Tensor, "3 s s"]],
-    count: int,
-    prompts: Sequence[PointPrompts] | Bool[Tensor, "o h w"],
-    start: int = 0,
-) -> Iterator[tuple[int, Float[Tensor, "o l l"]]]:
+    model: Sam2VideoModel, frame: FrameReader, count: int, prompts: Prompts, start: int = 0
+) -> MaskLogits:
     """Mask logits of the objects, positive inside, for each photo, at a quarter of the network's input size.
 
     `prompts` mark the objects in photo `start`, by points or by masks; memory attention propagates them forwards to

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 from transformers import Sam2VideoModel
 
-from stages.core.models.promptable import PointPrompts
+from stages.core.models.promptable import FrameReader, MaskLogits, Prompts
 from stages.core.models.sam2.mask_generation import propose_masks
 from stages.core.models.sam2.network import input_side, pixel_values, propagate_masks
 
@@ -28,12 +27,6 @@ class Sam2Segmenter:
         """Automatic masks of a photo, highest predicted IoU first."""
         return propose_masks(self.model, pixels).masks
 
-    def propagate(
-        self,
-        frame: Callable[[int], Float[Tensor, "3 s s"]],
-        count: int,
-        prompts: Sequence[PointPrompts] | Bool[Tensor, "o l l"],
-        start: int = 0,
-    ) -> Iterator[tuple[int, Float[Tensor, "o l l"]]]:
+    def propagate(self, frame: FrameReader, count: int, prompts: Prompts, start: int = 0) -> MaskLogits:
         """Mask logits of all objects for each frame, from `start` to the end, then backwards to the first."""
         return propagate_masks(self.model, frame, count, prompts, start)

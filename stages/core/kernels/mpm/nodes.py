@@ -12,6 +12,148 @@ import warp as wp
 
 mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 
+# P2G node by node. `value_of` gives what is added to number n of a node; `add` does so atomically, on CUDA only, where
+# consecutive lanes whose particles share a cell (a run) are summed before: lane l sums lanes l to l + 7 of its run, and
+# every eighth lane of a run writes. All 32 lanes of the warp must take part.
+SCATTER = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x & 31;
+    const int before = __shfl_up_sync(all, first, 1);
+    const unsigned heads = __ballot_sync(all, lane == 0 || before != first);
+    const int start = 31 - __clz(heads & (all >> (31 - lane)));
+    const int rank = lane - start;
+    const bool far1 = __any_sync(all, rank >= 1), far2 = __any_sync(all, rank >= 2), far4 = __any_sync(all, rank >= 4);
+    const unsigned after = heads & ~(all >> (31 - lane));
+    const int left = (after ? __ffs(after) - 1 : 32) - lane;  // lanes of the run from this one on
+    const bool writes = first >= 0 && (rank & 7) == 0;
+#endif
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
+        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
+        const float d[3] = {i - fx.c[0], j - fx.c[1], k - fx.c[2]};
+        number* node = base + 4 * (i * stride_x + j * stride_y + k);
+        number value[4];
+        for (int n = 0; n < 4; ++n)
+            value[n] = value_of(w * (affine.data[0][n] + d[0] * affine.data[1][n] + d[1] * affine.data[2][n]
+                                     + d[2] * affine.data[3][n]), n);
+#if defined(__CUDA_ARCH__)
+        if (far1) for (int n = 0; n < 4; ++n) {
+            const number other = __shfl_down_sync(all, value[n], 1);
+            value[n] += left > 1 ? other : 0;
+        }
+        if (far2) for (int n = 0; n < 4; ++n) {
+            const number other = __shfl_down_sync(all, value[n], 2);
+            value[n] += left > 2 ? other : 0;
+        }
+        if (far4) for (int n = 0; n < 4; ++n) {
+            const number other = __shfl_down_sync(all, value[n], 4);
+            value[n] += left > 4 ? other : 0;
+        }
+        if (writes) add(node, value);
+#else
+        for (int n = 0; n < 4; ++n) node[n] += value[n];
+#endif
+    }
+"""
+
+# G2P from momentum: `weigh` sets u to the velocity, times its weight, of node (i, j, k) of the stencil, whose four
+# numbers are at `node`.
+GATHER = """
+    wp::mat_t<4, 3, wp::float32> out;
+    for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        float sum[3] = {0.0f, 0.0f, 0.0f}, tilt[3] = {0.0f, 0.0f, 0.0f};
+#pragma unroll
+        for (int k = 0; k < 3; ++k) {
+            float u[3];
+            weigh(base + 4 * (i * stride_x + j * stride_y + k), i, j, k, u);
+            for (int n = 0; n < 3; ++n) { sum[n] += u[n]; tilt[n] += u[n] * (k - fx.c[2]); }
+        }
+        for (int n = 0; n < 3; ++n) {
+            out.data[0][n] += sum[n];
+            out.data[1][n] += sum[n] * (i - fx.c[0]);
+            out.data[2][n] += sum[n] * (j - fx.c[1]);
+            out.data[3][n] += tilt[n];
+        }
+    }
+    return out;
+"""
+
+_P2G = """
+    // Particle to grid. affine: row 0 is momentum and mass at the particle, rows 1 to 3 their change per cell along
+    // x, y, z. first < 0: nothing to scatter.
+    typedef float number;
+    number* base = (number*)(momentum.data + first);
+#if !defined(__CUDA_ARCH__)
+    if (first < 0) return;
+    typedef float quad __attribute__((ext_vector_type(4), aligned(4)));
+    typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
+    const quad P = *(const quad*)affine.data[0], X = *(const quad*)affine.data[1];
+    const quad Y = *(const quad*)affine.data[2], Z = *(const quad*)affine.data[3];
+    const quad corner = P - fx.c[0] * X - fx.c[1] * Y - fx.c[2] * Z;
+    const quad k1 = corner + Z, k2 = k1 + Z;
+    const float a = weight.data[2][0], b = weight.data[2][1], c = weight.data[2][2];
+    const lanes wz = {a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
+    const quad none = 0;
+    lanes row = wz * __builtin_shufflevector(__builtin_shufflevector(corner, k1, 0, 1, 2, 3, 4, 5, 6, 7),
+                                             __builtin_shufflevector(k2, none, 0, 1, 2, 3, 4, 5, 6, 7),
+                                             0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const lanes stepX = wz * __builtin_shufflevector(X, X, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    const lanes stepY = wz * __builtin_shufflevector(Y, Y, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    for (int i = 0; i < 3; ++i) {
+        lanes value = row;
+        for (int j = 0; j < 3; ++j) {
+            lanes* node = (lanes*)(base + 4 * (i * stride_x + j * stride_y));
+            *node += (weight.data[0][i] * weight.data[1][j]) * value;
+            value += stepY;
+        }
+        row += stepX;
+    }
+#else
+    const auto value_of = [](float sum, int n) { return sum; };
+    const auto add = [](number* node, const number* value) {
+#if __CUDA_ARCH__ >= 900
+        atomicAdd((float4*)node, make_float4(value[0], value[1], value[2], value[3]));
+#else
+        for (int n = 0; n < 4; ++n) atomicAdd(node + n, value[n]);
+#endif
+    };
+"""
+
+_G2P_OF_MOMENTUM = """
+    // Divides by mass at each node, and applies the floor condition of grid.apply_walls to the lowest `under` layers of
+    // the stencil.
+    const float* base = (const float*)(momentum.data + first);
+    const auto weigh = [&](const float* node, int i, int j, int k, float* u) {
+        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
+#if defined(__CUDA_ARCH__)
+        const float4 q = *(const float4*)node;
+        const float m = __fdividef(w, fmaxf(q.w, 1e-30f));
+        u[0] = m * q.x; u[1] = m * q.y; u[2] = m * q.z;
+#else
+        const float m = w / (node[3] > 1e-30f ? node[3] : 1e-30f);
+        for (int n = 0; n < 3; ++n) u[n] = m * node[n];
+#endif
+        if (k < under && u[2] < 0.0f) {
+            float left = keep;
+            if (keep < 0.0f) {
+                const float speed = sqrtf(u[0] * u[0] + u[1] * u[1]);
+                const float stop = -friction.data[first + i * stride_x + j * stride_y + k] * u[2];
+                left = speed > stop ? 1.0f - stop / speed : 0.0f;
+            }
+            u[0] *= left; u[1] *= left; u[2] = 0.0f;
+        }
+    };
+"""
+
 
 @wp.func_native("""
     // Grid to particle (G2P) from node velocities: row 0 of the result is sum w v, rows 1 to 3 are sum w v d with the
@@ -71,83 +213,7 @@ def gather_nodes(
     """G2P from node velocities: sums (4, 3) over the stencil of w v and of w v x offset [cells]."""
 
 
-@wp.func_native("""
-    // Particle to grid (P2G). affine: row 0 is momentum and mass at the particle, rows 1 to 3 their change per cell
-    // along x, y, z. first < 0: nothing to scatter.
-    float* base = (float*)(momentum.data + first);
-#if !defined(__CUDA_ARCH__)
-    if (first < 0) return;
-    typedef float quad __attribute__((ext_vector_type(4), aligned(4)));
-    typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
-    const quad P = *(const quad*)affine.data[0], X = *(const quad*)affine.data[1];
-    const quad Y = *(const quad*)affine.data[2], Z = *(const quad*)affine.data[3];
-    const quad corner = P - fx.c[0] * X - fx.c[1] * Y - fx.c[2] * Z;
-    const quad k1 = corner + Z, k2 = k1 + Z;
-    const float a = weight.data[2][0], b = weight.data[2][1], c = weight.data[2][2];
-    const lanes wz = {a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
-    const quad none = 0;
-    lanes row = wz * __builtin_shufflevector(__builtin_shufflevector(corner, k1, 0, 1, 2, 3, 4, 5, 6, 7),
-                                             __builtin_shufflevector(k2, none, 0, 1, 2, 3, 4, 5, 6, 7),
-                                             0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    const lanes stepX = wz * __builtin_shufflevector(X, X, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
-    const lanes stepY = wz * __builtin_shufflevector(Y, Y, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
-    for (int i = 0; i < 3; ++i) {
-        lanes value = row;
-        for (int j = 0; j < 3; ++j) {
-            lanes* node = (lanes*)(base + 4 * (i * stride_x + j * stride_y));
-            *node += (weight.data[0][i] * weight.data[1][j]) * value;
-            value += stepY;
-        }
-        row += stepX;
-    }
-#else
-    // Consecutive lanes whose particles share a cell (a run) are summed before the atomics: lane l sums lanes l to
-    // l + 7 of its run, and every eighth lane of a run writes. All 32 lanes of the warp must take part.
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31;
-    const int before = __shfl_up_sync(all, first, 1);
-    const unsigned heads = __ballot_sync(all, lane == 0 || before != first);
-    const int start = 31 - __clz(heads & (all >> (31 - lane)));
-    const int rank = lane - start;
-    const bool far1 = __any_sync(all, rank >= 1), far2 = __any_sync(all, rank >= 2), far4 = __any_sync(all, rank >= 4);
-    const unsigned after = heads & ~(all >> (31 - lane));
-    const int left = (after ? __ffs(after) - 1 : 32) - lane;  // lanes of the run from this one on
-    const bool writes = first >= 0 && (rank & 7) == 0;
-#pragma unroll
-    for (int i = 0; i < 3; ++i)
-#pragma unroll
-    for (int j = 0; j < 3; ++j)
-#pragma unroll
-    for (int k = 0; k < 3; ++k) {
-        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
-        const float d[3] = {i - fx.c[0], j - fx.c[1], k - fx.c[2]};
-        float value[4];
-        for (int n = 0; n < 4; ++n)
-            value[n] = w * (affine.data[0][n] + d[0] * affine.data[1][n] + d[1] * affine.data[2][n]
-                            + d[2] * affine.data[3][n]);
-        if (far1) for (int n = 0; n < 4; ++n) {
-            const float other = __shfl_down_sync(all, value[n], 1);
-            value[n] += left > 1 ? other : 0.0f;
-        }
-        if (far2) for (int n = 0; n < 4; ++n) {
-            const float other = __shfl_down_sync(all, value[n], 2);
-            value[n] += left > 2 ? other : 0.0f;
-        }
-        if (far4) for (int n = 0; n < 4; ++n) {
-            const float other = __shfl_down_sync(all, value[n], 4);
-            value[n] += left > 4 ? other : 0.0f;
-        }
-        if (writes) {
-            float* node = base + 4 * (i * stride_x + j * stride_y + k);
-#if __CUDA_ARCH__ >= 900
-            atomicAdd((float4*)node, make_float4(value[0], value[1], value[2], value[3]));
-#else
-            for (int n = 0; n < 4; ++n) atomicAdd(node + n, value[n]);
-#endif
-        }
-    }
-#endif
-""")
+@wp.func_native(_P2G + SCATTER + "#endif\n")
 def scatter_nodes(
     momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
     affine: wp.mat44,
@@ -190,50 +256,7 @@ def velocity_from_momentum(
     """
 
 
-@wp.func_native("""
-    // As gather_nodes, from momentum: divides by mass at each node, and applies the floor condition of grid.apply_walls
-    // to the lowest `under` layers of the stencil.
-    wp::mat_t<4, 3, wp::float32> out;
-    for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
-    const float* base = (const float*)(momentum.data + first);
-#pragma unroll
-    for (int i = 0; i < 3; ++i)
-#pragma unroll
-    for (int j = 0; j < 3; ++j) {
-        const float wij = weight.data[0][i] * weight.data[1][j];
-        const float* row = base + 4 * (i * stride_x + j * stride_y);
-        float sum[3] = {0.0f, 0.0f, 0.0f}, tilt[3] = {0.0f, 0.0f, 0.0f};
-#pragma unroll
-        for (int k = 0; k < 3; ++k) {
-#if defined(__CUDA_ARCH__)
-            const float4 node = ((const float4*)row)[k];
-            const float m = __fdividef(wij * weight.data[2][k], fmaxf(node.w, 1e-30f));
-            float u[3] = {m * node.x, m * node.y, m * node.z};
-#else
-            const float* node = row + 4 * k;
-            const float m = wij * weight.data[2][k] / (node[3] > 1e-30f ? node[3] : 1e-30f);
-            float u[3] = {m * node[0], m * node[1], m * node[2]};
-#endif
-            if (k < under && u[2] < 0.0f) {
-                float left = keep;
-                if (keep < 0.0f) {
-                    const float speed = sqrtf(u[0] * u[0] + u[1] * u[1]);
-                    const float stop = -friction.data[first + i * stride_x + j * stride_y + k] * u[2];
-                    left = speed > stop ? 1.0f - stop / speed : 0.0f;
-                }
-                u[0] *= left; u[1] *= left; u[2] = 0.0f;
-            }
-            for (int n = 0; n < 3; ++n) { sum[n] += u[n]; tilt[n] += u[n] * (k - fx.c[2]); }
-        }
-        for (int n = 0; n < 3; ++n) {
-            out.data[0][n] += sum[n];
-            out.data[1][n] += sum[n] * (i - fx.c[0]);
-            out.data[2][n] += sum[n] * (j - fx.c[1]);
-            out.data[3][n] += tilt[n];
-        }
-    }
-    return out;
-""")
+@wp.func_native(_G2P_OF_MOMENTUM + GATHER)
 def gather_momentum(
     momentum: wp.array[wp.vec4], friction: wp.array[float], first: int, stride_x: int, stride_y: int, weight: wp.mat33,
     fx: wp.vec3, under: int, keep: float,

@@ -94,7 +94,7 @@ def _best(scene: Scene, own: Gaussians, files: dict[int, Path] | None) -> int | 
         K = resize(scene.cameras.Ks[i], w / width, h / height)
         inside = project(own.means, viewmat, K) / torch.tensor([w, h])
         whole = ((inside >= 0) & (inside <= 1)).all(1) & (depths(own.means, viewmat) > 0)
-        weight = visibility(scene.gaussians, viewmat, K, w, h)[1][scene.gaussians.object_id == own.object_id[0]]
+        weight = visibility(scene.gaussians, viewmat, K, w, h).weight[scene.gaussians.object_id == own.object_id[0]]
         visible[i] = float(weight.sum()) * float(whole.float().mean()) ** 2
         tilt[i] = max(TRAINED_ELEVATIONS[0] - elevation, elevation - TRAINED_ELEVATIONS[1], 0.0)
     top = max(visible.values(), default=0.0)

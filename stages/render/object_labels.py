@@ -27,7 +27,7 @@ Image = Float[Tensor, "h w 3"]
 def visible_ids(gaussians: Gaussians, cameras: Cameras, index: int) -> Int[Tensor, "h w"]:
     """Object id of the Gaussian with the largest weight in each pixel; 0 for the background."""
     width, height = cameras.sizes[index].tolist()
-    front, _ = visibility(gaussians, cameras.viewmats[index], cameras.Ks[index], width, height)
+    front = visibility(gaussians, cameras.viewmats[index], cameras.Ks[index], width, height).index
     ids = gaussians.object_id.to(front.device)[front.clamp_min(0).long()]
     return torch.where(front >= 0, ids, 0).cpu()
 

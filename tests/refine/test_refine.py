@@ -204,7 +204,7 @@ def test_large_discs_are_hidden_only_behind_a_surface(device):
     eye = torch.tensor([[0.0, 0.01, 1.0]])
     viewmats, Ks = look_at(eye, torch.zeros(1, 3)), intrinsics(200, 200, 300.0)[None]
     scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
-    _, weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200)
+    weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200).weight
     assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
     assert ObservedSpace.of(scene, device).is_hidden(fur, wide).tolist() == [True, False]
 

@@ -67,7 +67,7 @@ def photographed(scene, view: int, draw) -> torch.Tensor:
 
 def label_image(scene, view: int) -> torch.Tensor:
     def draw(viewmat, K, side):
-        front, _ = visibility(scene.gaussians, viewmat, K, side, side)
+        front = visibility(scene.gaussians, viewmat, K, side, side).index
         return torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0)
 
     return photographed(scene, view, draw)
@@ -93,7 +93,7 @@ def test_label_images_of_photos_are_undistorted(truth, tmp_path):
 
 def test_label_images_of_undistorted_views_are_used_as_they_are(truth, tmp_path):
     for i in range(3):
-        front, _ = visibility(truth.gaussians, truth.cameras.viewmats[i], truth.cameras.Ks[i], SIDE, SIDE)
+        front = visibility(truth.gaussians, truth.cameras.viewmats[i], truth.cameras.Ks[i], SIDE, SIDE).index
         write_labels(tmp_path / f"{i:02d}.png", truth.gaussians.object_id[front.clamp_min(0).long()] * (front >= 0))
     as_they_are, warped = mask_overlaps(truth, tmp_path, undistorted=True), mask_overlaps(truth, tmp_path)
     assert sum(as_they_are) > sum(warped) + 0.1

@@ -30,7 +30,7 @@ def true_masks(scene):
     """A label image for each camera: the object that each pixel shows."""
     masks = []
     for viewmat, K, size in zip(scene.cameras.viewmats, scene.cameras.Ks, scene.cameras.sizes, strict=True):
-        index, _ = visibility(scene.gaussians, viewmat, K, *size.tolist())
+        index = visibility(scene.gaussians, viewmat, K, *size.tolist()).index
         masks.append(torch.where(index >= 0, scene.gaussians.object_id[index.clamp_min(0)], 0))
     return masks
 

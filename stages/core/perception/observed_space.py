@@ -48,7 +48,7 @@ class ObservedSpace:
             depth = torch.where(rendered.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0].cpu())
             if weigh:
-                weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
+                weight = torch.maximum(weight, visibility(g, viewmat, K, width, height).weight)
         return ObservedSpace(views, maps, weight.cpu(), device)
 
     def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
@@ -89,8 +89,8 @@ class ObservedSpace:
         joint, added = concatenate([scene, added]).to(self.device), added.to(self.device)
         keep = torch.ones(len(added), dtype=torch.bool, device=self.device)
         for viewmat, K, width, height in self.views:
-            weight = visibility(joint, viewmat, K, width, height)[1][len(scene) :]
-            bare = visibility(added, viewmat, K, width, height)[1]
+            weight = visibility(joint, viewmat, K, width, height).weight[len(scene) :]
+            bare = visibility(added, viewmat, K, width, height).weight
             keep &= weight <= (max_leak * bare).clamp_min(max_weight)
         return keep.cpu()
 
@@ -104,7 +104,7 @@ def object_psnr(before: Scene, after: Scene, max_views: int = 4, device: str = "
     states = [scene.gaussians.to(device) for scene in (before, after)]
     for viewmat, K, width, height in downscaled_views(before.cameras, max_views):
         one, two = (rasterise(g, viewmat[None], K[None], width, height).rgb[0] for g in states)
-        index, _ = visibility(states[0], viewmat, K, width, height)
+        index = visibility(states[0], viewmat, K, width, height).index
         on = (index >= 0) & (states[0].object_id[index.clamp_min(0)] > 0)
         error += float((one.clamp(0, 1) - two.clamp(0, 1))[on].square().sum())
         count += 3 * float(on.sum())

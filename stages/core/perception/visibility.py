@@ -37,7 +37,7 @@ def summed_view_directions(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3
     """
     toward = torch.zeros(len(g), 3)
     for viewmat, K, width, height in downscaled_views(cameras):
-        _, weight = visibility(g, viewmat, K, width, height)
+        weight = visibility(g, viewmat, K, width, height).weight
         eye = centres(viewmat[None])[0]
         toward += weight[:, None].cpu() * torch.nn.functional.normalize(eye - g.means, dim=1)
     return toward

@@ -16,7 +16,7 @@ from stages.core.geometry.cameras import resize as resize_K
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import find_support
-from stages.core.raster.rasterise import rasterise_with_index
+from stages.core.raster.rasterise import visibility
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class ViewFootprint:
         """The footprint of view number `view`, rendered on the device of the Gaussians."""
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = voting_intrinsics(scene, view)
-        rgb, _, depth, front, weight = rasterise_with_index(g, viewmat, K, width, height)
+        rgb, _, depth, front, weight = visibility(g, viewmat, K, width, height)
         viewmat, K = viewmat.to(g.means), K.to(g.means)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
         z = depths(g.means, viewmat)

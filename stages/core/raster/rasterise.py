@@ -21,7 +21,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import degree_of
 from stages.core.kernels.interop import kernel_device
 from stages.core.kernels.splat.binning import Bins, bin_splats
-from stages.core.kernels.splat.compositing import composite, composite_with_dominant, dominant_splats
+from stages.core.kernels.splat.compositing import composite, composite_with_dominant
 from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.kernels.splat.tiles import Capacity, Tiles, bin_tiles
 from stages.core.scene.gaussians import Gaussians
@@ -108,33 +108,25 @@ def rasterise_features(
     return _stack([_features(g, features.to(g.means.device), view) for view in views]).to(gaussians.means.device)
 
 
+class Visibility(NamedTuple):
+    """What one camera sees over black; rgb, alpha and depth as in `Rendering`."""
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    index: Int[Tensor, "h w"]  # the Gaussian with the largest weight in each pixel, -1: none
+    weight: Float[Tensor, "n"]  # each Gaussian's total weight [px]
+
+
 @torch.no_grad()
 def visibility(
-    gaussians: Gaussians,
-    viewmat: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
-    width: int,
-    height: int,
-) -> tuple[Int[Tensor, "h w"], Float[Tensor, "n"]]:
-    """The Gaussian with the largest weight in each pixel (-1: none), and each Gaussian's total weight [px]."""
-    g = _drawable(gaussians)
-    index, weight = dominant_splats(*_splats(g, _View(viewmat, K, width, height).packed(g), width, height))
-    return index.to(gaussians.means.device), weight.to(gaussians.means.device)
-
-
-@torch.no_grad()
-def rasterise_with_index(
-    gaussians: Gaussians,
-    viewmat: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
-    width: int,
-    height: int,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Int[Tensor, "h w"], Float[Tensor, "n"]]:
-    """One view over black, drawn once: rgb, alpha and depth as in `Rendering`, and index and weight of `visibility`."""
+    gaussians: Gaussians, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
+) -> Visibility:
+    """Which Gaussians are seen in a view of this size [px], and its images. Not differentiable."""
     g = _drawable(gaussians)
     splats, bins = _splats(g, _View(viewmat, K, width, height).packed(g), width, height)
     rgb, depth, alpha, index, weight = composite_with_dominant(splats, bins)
-    return tuple(x.to(gaussians.means.device) for x in (rgb, alpha, depth, index, weight))
+    return Visibility(*(x.to(gaussians.means.device) for x in (rgb, alpha, depth, index, weight)))
 
 
 def _drawable(g: Gaussians) -> Gaussians:

@@ -35,7 +35,7 @@ def make_example(out: Path, photos: int = 26) -> None:
         viewmat, K = scene.cameras.viewmats[i], scene.cameras.Ks[i]
         drawn = rasterise(scene.gaussians, viewmat[None], K[None], WIDTH, HEIGHT, WALL)
         write_jpeg(out / "photos" / name, drawn.rgb[0])
-        index, _ = visibility(scene.gaussians, viewmat, K, WIDTH, HEIGHT)
+        index = visibility(scene.gaussians, viewmat, K, WIDTH, HEIGHT).index
         labels = torch.where(index >= 0, scene.gaussians.object_id[index.clamp_min(0)], 0)
         write_labels(out / "masks" / f"{Path(name).stem}.png", labels)
     (out / "masks/names.json").write_text(json.dumps({o.id: o.name for o in scene.objects}))

@@ -129,7 +129,7 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
     views, values = camera_arc(REAR_VIEWS, REAR_AZIMUTH, 20.0), []
     for viewmat, K in zip(views.viewmats, views.Ks, strict=True):
         mine, real = (rasterise(s.gaussians, viewmat[None], K[None], IMAGE_SIZE, IMAGE_SIZE).rgb for s in (scene, true))
-        index, _ = visibility(true.gaussians, viewmat, K, IMAGE_SIZE, IMAGE_SIZE)
+        index = visibility(true.gaussians, viewmat, K, IMAGE_SIZE, IMAGE_SIZE).index
         on = (index >= 0) & (true.gaussians.object_id[index.clamp_min(0)] > 0)
         values.append(psnr(mine[:, on].clamp(0, 1), real[:, on].clamp(0, 1)))
     return sum(values) / len(values)

@@ -38,6 +38,6 @@ def visible_labels(scene: Scene, names: Sequence[str]) -> Int[Tensor, "p"]:
     for name in names:
         i = scene.cameras.names.index(name)
         width, height = scene.cameras.sizes[i].tolist()
-        front, _ = visibility(scene.gaussians, scene.cameras.viewmats[i], scene.cameras.Ks[i], width, height)
+        front = visibility(scene.gaussians, scene.cameras.viewmats[i], scene.cameras.Ks[i], width, height).index
         out.append(torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0).flatten())
     return torch.cat(out)

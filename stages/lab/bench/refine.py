@@ -52,7 +52,7 @@ def remove_unseen_background(scene: Scene) -> Scene:
     g = scene.gaussians
     weight = torch.zeros(len(g))
     for viewmat, K, width, height in downscaled_views(scene.cameras):
-        weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
+        weight = torch.maximum(weight, visibility(g, viewmat, K, width, height).weight)
     return replace(scene, gaussians=g[(g.object_id > 0) | (weight > MAX_HIDDEN_WEIGHT)])
 
 

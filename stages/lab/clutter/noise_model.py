@@ -76,7 +76,7 @@ def observed(
         w, h = round(width * scale), round(height * scale)
         K = resize(scene.cameras.Ks[i], w / width, h / height)
         drawn = rasterise(g, scene.cameras.viewmats[[i]], K[None], w, h)
-        front, weight = visibility(g, scene.cameras.viewmats[i], K, w, h)
+        *_, front, weight = visibility(g, scene.cameras.viewmats[i], K, w, h)
         seen += weight > 0.5
         fronts.append(front)
         parts.append(_view_points(drawn.rgb[0].numpy(), drawn.depth[0].numpy(), scene.cameras.viewmats[i], K, d, rng))

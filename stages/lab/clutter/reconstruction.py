@@ -83,7 +83,7 @@ def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
 def label_image(scene: Scene, view: int) -> Int[Tensor, "h w"]:
     """The object of the Gaussian with the largest weight in each pixel of a view; 0 where there is none."""
     width, height = scene.cameras.sizes[view].tolist()
-    front, _ = visibility(scene.gaussians, scene.cameras.viewmats[view], scene.cameras.Ks[view], width, height)
+    front = visibility(scene.gaussians, scene.cameras.viewmats[view], scene.cameras.Ks[view], width, height).index
     return torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0)
 
 

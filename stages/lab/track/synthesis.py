@@ -13,7 +13,7 @@ from stages.core.geometry.cameras import centres, resize
 from stages.core.geometry.harmonics import C0, rotate_sh
 from stages.core.geometry.rotations import multiply, quaternion
 from stages.core.physics.keypoints import farthest_points
-from stages.core.raster.rasterise import rasterise, rasterise_with_index
+from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.track.poses import Poses
@@ -105,7 +105,7 @@ class Synthesiser:
     def draw(self, camera: Camera, poses: Poses, reduction: int = 1) -> Synthesis:
         """What a camera sees of the objects at these poses, at a whole fraction of its resolution."""
         g, (width, height) = self.objects(poses), camera.size
-        rgb, alpha, depth, index, _ = rasterise_with_index(g, camera.viewmat, camera.K, width, height)
+        rgb, alpha, depth, index, _ = visibility(g, camera.viewmat, camera.K, width, height)
         image, front = camera.in_front(rgb, alpha, depth)
         seen = front & (alpha > MIN_ALPHA) & (index >= 0)
         label = torch.where(seen, self.row[index.clamp_min(0)], -1)

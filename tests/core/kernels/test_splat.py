@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from stages.core.kernels.splat.binning import bin_splats, depth_order_reference
-from stages.core.kernels.splat.compositing import composite, composite_reference, dominant_splats
+from stages.core.kernels.splat.compositing import composite, composite_reference, composite_with_dominant
 from stages.core.kernels.splat.projection import BIN_SIZE, TILE_SIZE, pack_camera, project, project_reference
 from stages.core.kernels.splat.simd import even_bounds
 from stages.core.kernels.splat.tiles import Capacity, bin_tiles
@@ -181,7 +181,7 @@ def test_dominant_splat_equals_the_reference(device):
     order = depth_order_reference(exact)
     *_, weights = composite_reference(exact, order, WIDTH, HEIGHT)
     best = torch.where(weights.amax(-1) > 0, order[weights.argmax(-1)], -1)
-    index, totals = (x.cpu() for x in dominant_splats(splats, bins))
+    index, totals = (x.cpu() for x in composite_with_dominant(splats, bins)[3:])
     assert (index == best).float().mean() > 0.999 and (index == -1).any()
     torch.testing.assert_close(totals[order].double(), weights.sum((0, 1)), rtol=1e-4, atol=1e-4)
 
@@ -232,7 +232,7 @@ def test_results_do_not_depend_on_the_number_of_threads(request):
         bins = bin_splats(keys, rects, 200, 150)
         images = composite(splats, bins, mean=True)
         grads = torch.autograd.grad(sum(image.square().sum() for image in images), [splats, *leaves])
-        results.append([bins.members, *images, *grads, *dominant_splats(splats.detach(), bins)])
+        results.append([bins.members, *images, *grads, *composite_with_dominant(splats.detach(), bins)[3:]])
     assert results[0][4].abs().sum() > 0 and len(results[0][0]) > 1.2 * 3000  # splats in several bins
     for others in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))

@@ -83,7 +83,7 @@ def test_a_ring_of_table_around_each_object_is_given_back(scene):
         near = knn(g.means[g.object_id == number], g.means[table], 1)[0][:, 0] < 0.01
         ids[table[near]] = number
     cameras = scene.cameras
-    seen = sum(visibility(g, V, K, 400, 300)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True)) > 5
+    seen = sum(visibility(g, V, K, 400, 300).weight for V, K in zip(cameras.viewmats, cameras.Ks, strict=True)) > 5
     found, wrong = refine_outlines(scene, ids), (ids > 0) & (g.object_id == 0) & seen
     assert wrong.sum() > 100
     assert (found == 0)[wrong].float().mean() > 0.95

@@ -13,7 +13,7 @@ from stages.core.kernels import interop
 from stages.core.kernels.splat.binning import depth_order_reference
 from stages.core.kernels.splat.compositing import composite_reference
 from stages.core.kernels.splat.projection import pack_camera, project_reference
-from stages.core.raster.rasterise import rasterise, rasterise_features, rasterise_with_index, visibility
+from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
 
@@ -170,7 +170,7 @@ def test_a_gpu_draws_where_no_kernel_can_be_compiled_for_the_cpu(monkeypatch):
         shot = rasterise(replace(g.to(home), means=leaf), *view, torch.ones(3, device=home))
         (shot.rgb * weight.to(home)).sum().backward()
         features = rasterise_features(g.to(home), g.scales.to(home), *view)
-        return shot.rgb.detach(), leaf.grad, features, shot.absgrad, *visibility(g.to(home), *one)
+        return shot.rgb.detach(), leaf.grad, features, shot.absgrad, *visibility(g.to(home), *one)[3:]
 
     expected = drawn("cuda")
     monkeypatch.setattr(interop, "compiles_for_cpu", lambda: False)
@@ -214,7 +214,7 @@ def test_empty_scene_shows_the_background():
     none = random_gaussians(5)[torch.zeros(5, dtype=torch.bool)]
     shot = draw(none, torch.tensor([0.1, 0.2, 0.3]))
     assert (shot.rgb == torch.tensor([0.1, 0.2, 0.3])).all() and (shot.alpha == 0).all() and (shot.depth == 0).all()
-    index, weight = visibility(none, EYE, K, SIZE, SIZE)
+    *_, index, weight = visibility(none, EYE, K, SIZE, SIZE)
     assert (index == -1).all() and weight.shape == (0,)
     assert rasterise_features(none, torch.zeros(0, 2), EYE[None], K[None], SIZE, SIZE).shape == (1, SIZE, SIZE, 2)
 
@@ -237,29 +237,28 @@ def test_features_are_composited_like_colours(device, count):
     assert torch.equal(shown, all_bins) and (shown > 0).any() and (shown == 0).any()
     # the derivative by a feature is the Gaussian's total weight
     (grad,) = torch.autograd.grad(image.sum(), colours)
-    weights = sum(visibility(gaussians, V, K, 48, 40)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))
+    weights = sum(visibility(gaussians, V, K, 48, 40).weight for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))
     torch.testing.assert_close(grad[:, -1], weights, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("device", devices)
-def test_one_projection_gives_image_and_index(device):
+def test_visibility_has_the_images_of_rasterise(device):
     gaussians = random_gaussians(300).to(device)
-    rgb, alpha, depth, index, weight = rasterise_with_index(gaussians, EYE, K, SIZE, SIZE)
+    rgb, alpha, depth, *_ = visibility(gaussians, EYE, K, SIZE, SIZE)
     shot = draw(gaussians)
     for found, separate in ((rgb, shot.rgb[0]), (alpha, shot.alpha[0]), (depth, shot.depth[0])):
         torch.testing.assert_close(found, separate)
-    assert all(map(torch.equal, (index, weight), visibility(gaussians, EYE, K, SIZE, SIZE)))
 
 
 @pytest.mark.parametrize("device", devices)
 def test_visibility_weights_sum_to_alpha(device):
     gaussians = random_gaussians(300).to(device)
-    index, weight = visibility(gaussians, EYE, K, SIZE, SIZE)
+    *_, index, weight = visibility(gaussians, EYE, K, SIZE, SIZE)
     alpha = draw(gaussians).alpha[0]
     assert float(weight.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
     assert torch.equal(index >= 0, alpha > 0)
     red, green = ((0.5, 0.0, 0.0), 0.1, 0.9, (1.0, 0.0, 0.0)), ((-0.5, 0.0, 0.0), 0.3, 0.9, (0.0, 1.0, 0.0))
-    index, weight = visibility(isotropic(green, red, device=device), EYE, K, SIZE, SIZE)
+    *_, index, weight = visibility(isotropic(green, red, device=device), EYE, K, SIZE, SIZE)
     assert index[20, 20] == 1 and index[20, 30] == 0 and index[0, 0] == -1 and (weight > 0).all()
 
 

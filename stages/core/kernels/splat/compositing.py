@@ -189,13 +189,9 @@ def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, 
     return function.apply(splats.contiguous(), bins, behind, mean)
 
 
-def dominant_splats(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor]:
-    """The splat with the largest weight in each pixel (h, w; -1: none), and each splat's total weight (n,) [px]."""
-    return composite_with_dominant(splats, bins)[3:]
-
-
 def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """`composite` over black with `mean`, and `dominant_splats`, in one pass. Not differentiable."""
+    """`composite` over black with `mean`; the splat with the largest weight in each pixel (h, w; -1: none), and each
+    splat's total weight (n,) [px]. Not differentiable."""
     if splats.is_cuda:
         return compositing_cuda.composite_with_dominant(splats, bins)
     index, state = torch.empty(bins.height, bins.width, dtype=torch.int32), _outputs(bins)

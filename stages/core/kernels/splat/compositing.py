@@ -6,6 +6,8 @@ masks hold the blocks that a splat overlaps and the blocks that are not yet fini
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -24,8 +26,6 @@ from stages.core.kernels.splat.pixel_blocks import (
 from stages.core.kernels.splat.projection import MIN_ALPHA
 from stages.core.kernels.splat.simd import VECTORS, launch_ranges, num_threads
 from stages.core.kernels.splat.tiles import Tiles
-
-wp.set_module_options({"enable_backward": False})
 
 _FORWARD = r"""
 F T[BLOCKS], colour[BLOCKS][4];
@@ -94,85 +94,72 @@ for _name, _value in (
     _FORWARD = _FORWARD.replace(_name, f"{_value}f")
 
 
-def _tracked(code: str, track: bool) -> str:
-    """The forward snippet with or without the lines that track the dominant splat of each pixel."""
-    return f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n{code}\n#undef TRACK\n"
+@cache
+def _forward(track: bool) -> wp.Kernel:
+    """Build the kernel; `track`: with the dominant splat of each pixel, `index`, and the splats' `totals`."""
+    macro = f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n"
+
+    @wp.func_native(macro + VECTORS + BIN_BLOCKS + _FORWARD + "\n#undef TRACK\n")
+    def composite_bin(
+        bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+        members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
+        stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
+        alphas: wp.array[float], index: wp.array[int], totals: wp.array[float],
+    ): ...  # fmt: skip
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite(
+        start: int, piece: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+        members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
+        stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
+        alphas: wp.array[float], index: wp.array[int], totals: wp.array[float],
+    ):  # fmt: skip
+        composite_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
+                      left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
+
+    return composite
 
 
-@wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, False))
-def _composite_bin(
-    bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
-    stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
-): ...  # fmt: skip
-
-
-@wp.kernel
-def _composite(
-    start: int, piece: int, width: int, height: int, across: int, step: int, mean: int,
-    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
-    rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
-):  # fmt: skip
-    _composite_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
-                   left, stops, ends, rgb, fourth, alphas)  # fmt: skip
-
-
-@wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, True))
-def _dominant_bin(
-    bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
-    stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
-    index: wp.array[int], totals: wp.array[float],
-): ...  # fmt: skip
-
-
-@wp.kernel
-def _dominant(
-    start: int, piece: int, width: int, height: int, across: int, step: int, mean: int,
-    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
-    rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
-    index: wp.array[int], totals: wp.array[float],
-):  # fmt: skip
-    _dominant_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
-                  left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
-
-
-def _outputs(bins: Bins) -> tuple[Tensor, ...]:
-    """Empty tensors: saved state of a forward pass (transmittance, stops, ends) and its images (rgb, fourth, alpha)."""
-    count, size = len(bins.starts) - 1, (bins.height, bins.width)
-    left, stops = torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32)
-    ends = torch.empty(count, dtype=torch.int32)
-    return left, stops, ends, torch.empty(*size, 3), torch.empty(size), torch.empty(size)
-
-
-def _arguments(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor) -> list:
+def _arguments(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor | None) -> list:
     """Kernel arguments, from the width on."""
     flat = (splats, bins.members, bins.starts, behind, *tensors)
     step = 0 if behind.dim() == 1 else 3
-    views = (view(t.view(-1)) for t in flat)
+    views = (None if t is None else view(t.view(-1)) for t in flat)
     return [bins.width, bins.height, bins.columns, step, int(mean), *views]
+
+
+def _draw(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, index: Tensor | None = None,
+          totals: Tensor | None = None) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
+    """Images (rgb, fourth, alpha) and saved state (transmittance, stops, ends); fills `index` and `totals` if given."""
+    count, size = len(bins.starts) - 1, (bins.height, bins.width)
+    state = [torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32),
+             torch.empty(count, dtype=torch.int32)]  # fmt: skip
+    images = [torch.empty(*size, 3), torch.empty(size), torch.empty(size)]
+    arguments = _arguments(splats, bins, behind, mean, *state, *images, index, totals)
+    launch_ranges(_forward(index is not None), bins.balanced_bounds(4 * num_threads()), arguments)
+    return images, state
+
+
+def _draw_adjoint(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *state: Tensor) -> Tensor:
+    """Gradient (n, 16) of the splats; `state`: as in `compositing_cuda.draw_adjoint`."""
+    return composite_adjoint(splats, bins, state[2], _arguments(splats, bins, behind, mean, *state))
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, splats, bins, behind, mean):
-        state = _outputs(bins)
-        bounds = bins.balanced_bounds(4 * num_threads())
-        launch_ranges(_composite, bounds, _arguments(splats, bins, behind, mean, *state))
-        left, stops, ends, rgb, fourth, alpha = state
-        ctx.save_for_backward(splats, behind, left, stops, ends, fourth, alpha)
+        draw = compositing_cuda.draw if splats.is_cuda else _draw
+        (rgb, fourth, alpha), state = draw(splats, bins, behind, mean)[:2]
+        ctx.save_for_backward(splats, behind, *state, fourth, alpha)
         ctx.bins, ctx.mean = bins, mean
         return rgb, fourth, alpha
 
     @staticmethod
     def backward(ctx, *upstream):
         splats, behind, *state = ctx.saved_tensors
+        draw_adjoint = compositing_cuda.draw_adjoint if splats.is_cuda else _draw_adjoint
         upstream = [v.float().contiguous() for v in upstream]
-        arguments = _arguments(splats, ctx.bins, behind, ctx.mean, *state, *upstream)
-        grads = composite_adjoint(splats, ctx.bins, state[2], arguments)
-        return grads, None, None, None
+        return draw_adjoint(splats, ctx.bins, behind, ctx.mean, *state, *upstream), None, None, None
 
 
 def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, mean: bool = False):
@@ -185,8 +172,7 @@ def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, 
     Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
     """
     behind = splats.new_zeros(3) if behind is None else behind.to(splats).contiguous()
-    function = compositing_cuda.Composite if splats.is_cuda else _Composite
-    return function.apply(splats.contiguous(), bins, behind, mean)
+    return _Composite.apply(splats.contiguous(), bins, behind, mean)
 
 
 def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -194,11 +180,10 @@ def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor,
     splat's total weight (n,) [px]. Not differentiable."""
     if splats.is_cuda:
         return compositing_cuda.composite_with_dominant(splats, bins)
-    index, state = torch.empty(bins.height, bins.width, dtype=torch.int32), _outputs(bins)
+    index = torch.empty(bins.height, bins.width, dtype=torch.int32)
     totals = torch.zeros(len(bins.members))  # of each pair of bin and splat
-    arguments = _arguments(splats, bins, torch.zeros(3), True, *state, index, totals)
-    launch_ranges(_dominant, bins.balanced_bounds(4 * num_threads()), arguments)
-    return *state[3:], index.long(), torch.bincount(bins.members, totals, len(splats)).float()
+    images, _ = _draw(splats, bins, torch.zeros(3), True, index, totals)
+    return *images, index.long(), torch.bincount(bins.members, totals, len(splats)).float()
 
 
 def composite_reference(

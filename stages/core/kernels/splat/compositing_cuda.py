@@ -268,14 +268,16 @@ def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, behind: Tensor, mea
     launch(kernel, THREADS * (len(tiles.starts) - 1), [*sizes, *flat], device=device_of(splats), block_dim=THREADS)
 
 
-def draw(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool) -> tuple[Tensor, ...]:
-    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)), and the transmittance (h, w) left, the end of the list
-    (h, w) and the splat with the largest weight (h, w; -1: none) of each pixel."""
+def draw(
+    splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, Tensor], Tensor]:
+    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)); the transmittance (h, w) left and the end of the list
+    (h, w) of each pixel; and the splat with the largest weight in it (h, w; -1: none)."""
     new, size = splats.new_empty, (tiles.height, tiles.width)
     left, stops, rgb = new(size), new(size, dtype=torch.int32), new(*size, 3)
     fourth, alpha, dominant = new(size), new(size), new(size, dtype=torch.int32)
     _launch(_composite, splats, tiles, behind, mean, left, stops, rgb, fourth, alpha, dominant)
-    return rgb, fourth, alpha, left, stops, dominant
+    return (rgb, fourth, alpha), (left, stops), dominant
 
 
 def draw_adjoint(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *state: Tensor) -> Tensor:
@@ -289,34 +291,15 @@ def draw_adjoint(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *stat
     return grads
 
 
-class Composite(torch.autograd.Function):
-    """As `compositing.composite`, without defaults."""
-
-    @staticmethod
-    def forward(ctx, splats, tiles, behind, mean):
-        """Images rgb (h, w, 3), fourth channel (h, w) and alpha (h, w) of splats (n, 16)."""
-        rgb, fourth, alpha, left, stops, _ = draw(splats, tiles, behind, mean)
-        ctx.save_for_backward(splats, behind, left, stops, fourth, alpha)
-        ctx.tiles, ctx.mean = tiles, mean
-        return rgb, fourth, alpha
-
-    @staticmethod
-    def backward(ctx, *upstream):
-        """Gradient (n, 16) of the splats from those of the three images."""
-        splats, behind, *state = ctx.saved_tensors
-        upstream = [v.float().contiguous() for v in upstream]
-        return draw_adjoint(splats, ctx.tiles, behind, ctx.mean, *state, *upstream), None, None, None
-
-
 def composite_with_dominant(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As `compositing.composite_with_dominant`, for splats and tiles on a CUDA device.
 
     A splat's total weight is the derivative of the sum over all pixels of a colour channel by the splat's colour.
     """
     behind = splats.new_zeros(3)
-    rgb, fourth, alpha, left, stops, dominant = draw(splats, tiles, behind, True)
+    (rgb, fourth, alpha), state, dominant = draw(splats, tiles, behind, True)
     v_rgb = torch.zeros_like(rgb)
     v_rgb[..., 0] = 1
     none = torch.zeros_like(alpha)
-    grads = draw_adjoint(splats, tiles, behind, True, left, stops, fourth, alpha, v_rgb, none, none)
+    grads = draw_adjoint(splats, tiles, behind, True, *state, fourth, alpha, v_rgb, none, none)
     return rgb, fourth, alpha, dominant.long(), grads[:, 6].contiguous()

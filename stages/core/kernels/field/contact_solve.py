@@ -15,6 +15,8 @@ the normal forces before: Castro et al. 2023, "A theory of irrotational contact 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import warp as wp
 
 from stages.core.kernels.field.groups import wait_for_group
@@ -131,28 +133,23 @@ def solver_arrays(device: str, scenes: int, bodies: int, contacts: int, group: i
     return found, memory
 
 
-@wp.func
-def _total(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
-    """The sum of the values of the first `used` threads, for all of them."""
-    memory.partial[scene, lane] = value
-    wait_for_group()
-    out = f64(0.0)
-    for i in range(used):
-        out += memory.partial[scene, i]
-    wait_for_group()
-    return out
+def _over_group(combine: Callable) -> wp.Function:
+    """A function that gives all threads the values of the first `used` ones and 0, `combine`d in their order."""
+
+    @wp.func
+    def over_group(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
+        memory.partial[scene, lane] = value
+        wait_for_group()
+        out = f64(0.0)
+        for i in range(used):
+            out = combine(out, memory.partial[scene, i])
+        wait_for_group()
+        return out
+
+    return over_group
 
 
-@wp.func
-def _largest(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
-    """The largest of the values of the first `used` threads."""
-    memory.partial[scene, lane] = value
-    wait_for_group()
-    out = f64(0.0)
-    for i in range(used):
-        out = wp.max(out, memory.partial[scene, i])
-    wait_for_group()
-    return out
+_total, _largest = _over_group(wp.add), _over_group(wp.max)
 
 
 @wp.func

@@ -17,8 +17,7 @@ OBJECTS = (SceneObject(1, "fast"), SceneObject(2, "slow"))
 def cube(at: tuple, velocity: tuple):
     """27 particles of rubber, half a cell apart."""
     x = torch.cartesian_prod(*[torch.arange(3) * DX / 2] * 3) + torch.tensor(at)
-    material = ParticleMaterial(*(torch.full((27,), value) for value in (1e5, 0.3, 1000.0, 0.0, 0.0)))
-    particles = at_rest(x, torch.full((27,), (DX / 2) ** 3), material)
+    particles = at_rest(x, (DX / 2) ** 3, ParticleMaterial(1e5, 0.3, 1000.0, 0.0, 0.0))
     particles.v[:] = torch.tensor(velocity)
     return particles
 

@@ -51,8 +51,7 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
     parts = []
     for n, (E, density) in enumerate(MATERIALS):
         x = body * h + torch.tensor([0.05 * n - 0.3, 0.03 * n - 0.3, -0.93 + n * (layers * h + 0.06)])
-        fill = [torch.full((len(x),), value) for value in (E, 0.3, density, 0.0, 0.5)]
-        parts.append(mpm.at_rest(x, torch.full((len(x),), h**3), mpm.ParticleMaterial(*fill)))
+        parts.append(mpm.at_rest(x, h**3, mpm.ParticleMaterial(E, 0.3, density, 0.0, 0.5)))
     return mpm.join_particles(parts), mpm.Box((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94)), 2 * h
 
 

@@ -85,10 +85,9 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     n = torch.from_numpy(data["n"]).long()
     each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
     x = torch.from_numpy(data["positions"][0]).float()
-    full = torch.ones(len(x))
     particles = mpm.at_rest(
         x, torch.from_numpy(data["volume"]).float(),
-        mpm.ParticleMaterial(each["E"], float(data["nu"]) * full, each["rho"], viscosity=0 * full, friction=0 * full),
+        mpm.ParticleMaterial(each["E"], float(data["nu"]), each["rho"], viscosity=0.0, friction=0.0),
         COROTATED,
     )  # fmt: skip
     dx = float(data["grid_lim"]) / int(data["n_grid"])

@@ -27,8 +27,7 @@ def particle_block(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosi
     counts = [max(1, round(s / h)) for s in size]
     x = (torch.cartesian_prod(*[torch.arange(n) + 0.5 for n in counts]) * h).reshape(-1, 3)
     x = x + jitter * h * (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5)
-    fill = [torch.full((len(x),), float(v)) for v in (E, nu, DENSITY, viscosity, 0.6)]
-    return mpm.at_rest(x, torch.full((len(x),), float(h**3)), mpm.ParticleMaterial(*fill), **material)
+    return mpm.at_rest(x, h**3, mpm.ParticleMaterial(E, nu, DENSITY, viscosity, 0.6), **material)
 
 
 def subset(p: mpm.Particles, mask: torch.Tensor) -> mpm.Particles:

@@ -65,8 +65,7 @@ class Asset:
 
     def particles(self, device: str = "cpu") -> mpm.Particles:
         """The object at rest about the origin."""
-        n = torch.ones(len(self.points))
-        material = mpm.ParticleMaterial(self.E * n, POISSON_RATIO * n, self.density * n, 0 * n, FRICTION * n)
+        material = mpm.ParticleMaterial(self.E, POISSON_RATIO, self.density, 0.0, FRICTION)
         made = mpm.at_rest(self.points, self.volume, material, MODELS["corotated"].kernel)
         return mpm.Particles(*(getattr(made, f.name).to(device) for f in fields(made)))
 

@@ -15,9 +15,7 @@ def cloud(p: int = 300, seed: int = 0) -> mpm.Particles:
     """Deformed, moving particles, some of them in the floor and in a wall of the box from 0 to 1."""
     rng = torch.Generator().manual_seed(seed)
     x = torch.rand(p, 3, generator=rng) * torch.tensor([0.3, 0.5, 0.5]) + torch.tensor([0.0, 0.25, 0.0])
-    full = torch.full((p,), 1.0)
-    material = mpm.ParticleMaterial(*(value * full for value in (2e5, 0.3, 900, 4, FRICTION)))
-    particles = mpm.at_rest(x, 1e-3 * full, material)
+    particles = mpm.at_rest(x, 1e-3, mpm.ParticleMaterial(2e5, 0.3, 900.0, 4.0, FRICTION))
     particles.v = torch.randn(p, 3, generator=rng) - torch.tensor([1.0, 0, 1])
     particles.C = torch.randn(p, 3, 3, generator=rng)
     particles.F = particles.F + 0.1 * torch.randn(p, 3, 3, generator=rng)

@@ -21,8 +21,7 @@ def block(
     counts = [max(1, round(s / h)) for s in size]
     x = torch.cartesian_prod(*[torch.arange(n) + 0.5 for n in counts]) * h
     x = x + (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5) * 0.5 * h + torch.tensor(low)
-    fill = [torch.full((len(x),), float(v)) for v in (E, nu, density, viscosity, friction)]
-    return mpm.at_rest(x, torch.full((len(x),), float(h**3)), mpm.ParticleMaterial(*fill))
+    return mpm.at_rest(x, h**3, mpm.ParticleMaterial(E, nu, density, viscosity, friction))
 
 
 def roll(solver: mpm.Solver, seconds: float, push: tuple = (0.0, 0.0, 0.0), frame: float = 0.02, **options) -> None:

@@ -8,29 +8,20 @@ import pytest
 import torch
 
 from stages.core.kernels.mpm.constitutive import SAND
+from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.body_shapes import BodyShape
 from stages.core.physics.mpm.contact import ContactSubsteps
-from stages.core.physics.mpm.solver import (
-    Box,
-    ParticleMaterial,
-    Particles,
-    Solver,
-    SolverOptions,
-    at_rest,
-    join_particles,
-)
 from stages.core.physics.mpm.split import SplitSubsteps
 
 DX, G = 0.05, 9.81
-BOX = Box((-1.0, -1.0, 0.0), (3.0, 1.0, 1.5))
+BOX = mpm.Box((-1.0, -1.0, 0.0), (3.0, 1.0, 1.5))
 
 
-def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, held: bool = False) -> Particles:
+def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, held: bool = False) -> mpm.Particles:
     """Eight particles in a cell of 1e6 Pa and 500 kg/m^3."""
     axes = [torch.arange(a + DX / 4, b, DX / 2) for a, b in zip(low, high, strict=True)]
     x = torch.cartesian_prod(*axes)
-    n = torch.ones(len(x))
-    p = at_rest(x, n * (DX / 2) ** 3, ParticleMaterial(1e6 * n, 0.3 * n, 500 * n, 30 * n, friction * n))
+    p = mpm.at_rest(x, (DX / 2) ** 3, mpm.ParticleMaterial(1e6, 0.3, 500.0, 30.0, friction))
     p.v[:, 0], p.held[:] = speed, int(held)
     return p
 
@@ -39,16 +30,16 @@ def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, he
 def solve(device):
     """Positions and velocities of each body after frames of 0.02 s, on the device of the test."""
 
-    def solve(bodies: list[Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
+    def solve(bodies: list[mpm.Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
         sizes = [len(b) for b in bodies]
-        options = SolverOptions(schedule="contact" if touch else "auto")
-        solver = Solver(join_particles(bodies), BOX, DX, device, options, sizes if touch else None)
+        options = mpm.SolverOptions(schedule="contact" if touch else "auto")
+        solver = mpm.Solver(mpm.join_particles(bodies), BOX, DX, device, options, sizes if touch else None)
         return moved(solver, sizes, frames, gravity)
 
     return solve
 
 
-def moved(solver: Solver, sizes: list[int], frames: int, gravity: float) -> tuple[list, list]:
+def moved(solver: mpm.Solver, sizes: list[int], frames: int, gravity: float) -> tuple[list, list]:
     pull = torch.tensor([0.0, 0.0, -gravity]) * (solver.particles.held.cpu() == 0)[:, None]
     for _ in range(frames):
         solver.advance(0.02, pull)
@@ -75,7 +66,7 @@ def test_a_block_slides_on_another_by_v2_over_2_mu_g(solve, friction):
     assert float(x[1][:, 0].mean()) - 0.15 == pytest.approx(1.2 * stop - friction * G * stop**2 / 2, rel=0.02)
 
 
-def planes(p: Particles) -> BodyShape:
+def planes(p: mpm.Particles) -> BodyShape:
     """The shape of a block, whose distance is that from the planes of its faces, also beside them."""
     h = DX / 2
     low, high = p.rest.amin(0).numpy() - h / 2, p.rest.amax(0).numpy() + h / 2
@@ -84,7 +75,7 @@ def planes(p: Particles) -> BodyShape:
     return BodyShape(np.maximum(low - x, x - high).max(-1), low - 4.5 * h, h)
 
 
-def turned(p: Particles, degrees: float) -> torch.Tensor:
+def turned(p: mpm.Particles, degrees: float) -> torch.Tensor:
     """Turn a block about the y axis, so that its x axis points downhill, and return the rotation."""
     a = math.radians(degrees)
     R = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
@@ -102,7 +93,8 @@ def test_a_block_slides_down_a_slope_as_a_point_mass_does(device, degrees, frict
     for p in (slab, slider):
         p.x[:, 2] += 0.6
     start, sizes = slider.x.clone(), [len(slab), len(slider)]
-    solver = Solver(join_particles([slab, slider]), BOX, DX, device, SolverOptions(schedule="contact"), sizes, shapes)
+    options = mpm.SolverOptions(schedule="contact")
+    solver = mpm.Solver(mpm.join_particles([slab, slider]), BOX, DX, device, options, sizes, shapes)
     x, _ = moved(solver, sizes, 20, G)
     a = math.radians(degrees)
     down = float(((x[1] - start).mean(0) @ R)[0])
@@ -170,14 +162,14 @@ def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(devi
     """
     bodies = [block((0, 0, 0), (0.4, 0.3, 0.15)), block((0.1, 0.05, 0.25), (0.3, 0.25, 0.45), speed=1.0),
               block((0.5, 0.05, 0.25), (0.65, 0.2, 0.4), speed=-1.0)]  # fmt: skip
-    joined, sizes = join_particles(bodies), [len(b) for b in bodies]
+    joined, sizes = mpm.join_particles(bodies), [len(b) for b in bodies]
 
     def run(kind, seed=None):
         start = joined
         if seed is not None:
             toward = torch.randn(joined.x.shape, generator=torch.Generator().manual_seed(seed)).sign() * torch.inf
             start = replace(joined, x=torch.nextafter(joined.x, toward))
-        solver = Solver(start, BOX, DX, device, SolverOptions(schedule="contact"), sizes)
+        solver = mpm.Solver(start, BOX, DX, device, mpm.SolverOptions(schedule="contact"), sizes)
         shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(start, sizes, None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         return torch.cat(moved(solver, sizes, 10, G)[0])
@@ -191,4 +183,4 @@ def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(devi
 
 def test_unknown_schedules_are_refused():
     with pytest.raises(ValueError, match="'both' is not a schedule"):
-        SolverOptions(schedule="both")
+        mpm.SolverOptions(schedule="both")

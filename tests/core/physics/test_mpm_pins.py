@@ -11,17 +11,9 @@ import warp as wp
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.pins import PinnedNodes, pin_nodes
 from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
+from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.pins import OUTSIDE, face_nodes
-from stages.core.physics.mpm.solver import (
-    CONTACT_FLOOR_GAP,
-    Box,
-    ParticleMaterial,
-    Particles,
-    Solver,
-    SolverOptions,
-    at_rest,
-)
 from stages.core.physics.mpm.split import SplitSubsteps
 
 SIDE, LENGTH, E, DENSITY = 0.1, 0.5, 2e5, 500.0  # of the beam [m], [Pa], [kg/m^3]
@@ -32,29 +24,28 @@ def rotation(degrees: float, axis: tuple) -> torch.Tensor:
     return torch.linalg.matrix_exp(torch.tensor([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]))
 
 
-def beam(n: int, nu: float, turn: torch.Tensor, shift: tuple) -> tuple[Particles, float]:
+def beam(n: int, nu: float, turn: torch.Tensor, shift: tuple) -> tuple[mpm.Particles, float]:
     """A beam along x, then turned, of n^2 particles in its section, held where x < 0; its grid spacing [m].
 
     `shift`: its position relative to the nodes [cells].
     """
     h = SIDE / n
     x = torch.cartesian_prod(torch.arange(-6, round(LENGTH / h)), torch.arange(n), torch.arange(n)) + 0.5
-    one = torch.ones(len(x))
-    material = ParticleMaterial(E * one, nu * one, DENSITY * one, 0 * one, 0.5 * one)
-    p = at_rest((x * h + 2 * h * torch.tensor(shift)) @ turn.mT, h**3 * one, material)
+    material = mpm.ParticleMaterial(E, nu, DENSITY, 0.0, 0.5)
+    p = mpm.at_rest((x * h + 2 * h * torch.tensor(shift)) @ turn.mT, h**3, material)
     p.held[:] = (x[:, 0] < 0).to(p.held.dtype)
     return p, 2 * h
 
 
-def solver_of(p: Particles, dx: float, device: str) -> Solver:
+def solver_of(p: mpm.Particles, dx: float, device: str) -> mpm.Solver:
     """A solver whose nodes are at multiples of dx."""
     low, high = p.x.amin(0) - 0.2, p.x.amax(0) + 0.2
-    low = dx * ((low / dx).floor() - torch.tensor([0.0, 0.0, 1 - CONTACT_FLOOR_GAP]))
-    box = Box(tuple(low.tolist()), tuple(high.tolist()))
-    return Solver(p, box, dx, device, SolverOptions(schedule="contact"))
+    low = dx * ((low / dx).floor() - torch.tensor([0.0, 0.0, 1 - mpm.CONTACT_FLOOR_GAP]))
+    box = mpm.Box(tuple(low.tolist()), tuple(high.tolist()))
+    return mpm.Solver(p, box, dx, device, mpm.SolverOptions(schedule="contact"))
 
 
-def settle(solver: Solver, pull: torch.Tensor, omega: float) -> torch.Tensor:
+def settle(solver: mpm.Solver, pull: torch.Tensor, omega: float) -> torch.Tensor:
     """Displacement at rest under an acceleration `pull` of what is free; `omega` of the slowest vibration [rad/s]."""
     start = solver.particles.x.cpu()
     acceleration = (solver.particles.held.cpu() == 0)[:, None] * pull
@@ -210,7 +201,7 @@ def test_what_is_released_falls_and_what_has_no_free_neighbours_stays(device):
     solver.advance(0.1, torch.tensor([0.0, 0.0, -9.81]) * (p.held == 0)[:, None])
     torch.testing.assert_close(solver.particles.x.cpu(), p.x, atol=0.02 * dx, rtol=0)
     far = (p.x[:, 0] < 0) | (p.x[:, 0] > 0.3)  # pinned and free particles that share no nodes
-    apart = Particles(*(getattr(p, f.name)[far] for f in fields(p)))
+    apart = mpm.Particles(*(getattr(p, f.name)[far] for f in fields(p)))
     apart.held[:] = (apart.x[:, 0] < 0).to(p.held.dtype)
     solver = solver_of(apart, dx, device)
     solver.advance(0.02, torch.tensor([0.0, 0.0, -9.81]) * (apart.held == 0)[:, None])

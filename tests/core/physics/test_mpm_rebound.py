@@ -64,8 +64,7 @@ def particles(n: int, loss: float) -> tuple[float, float]:
     h = SIDE / n
     along = (torch.arange(n) + 0.5) * h
     x = torch.cartesian_prod(along - SIDE / 2, along - SIDE / 2, along + 0.05 * h)
-    one = torch.ones(len(x))
-    p = at_rest(x, one * h**3, ParticleMaterial(E * one, NU * one, DENSITY * one, viscosity(loss) * one, 0 * one))
+    p = at_rest(x, h**3, ParticleMaterial(E, NU, DENSITY, viscosity(loss), 0.0))
     p.v[:, 2] = -1.0
     box = Box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.6))
     solver = Solver(p, box, 2 * h, options=SolverOptions(schedule="contact"))

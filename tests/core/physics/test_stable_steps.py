@@ -52,9 +52,8 @@ def test_batches_on_a_gpu_are_limited_by_four_fifths_of_its_free_memory(monkeypa
 
 
 def some_particles(count: int):
-    material = ParticleMaterial(*(torch.full((count,), value) for value in (1e5, 0.3, 1000.0, 2.0, 0.0)))
     x = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
-    return at_rest(x, torch.full((count,), 1e-3), material)
+    return at_rest(x, 1e-3, ParticleMaterial(1e5, 0.3, 1000.0, 2.0, 0.0))
 
 
 @pytest.mark.parametrize("sizes", [(3, 4), (4, 5), (8, 0), (9, -1)])

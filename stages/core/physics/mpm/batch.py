@@ -6,7 +6,7 @@
         frame.of("b").x             # of one scene: a view
     batch.failures()                # {"b": "particle 17 left the box or is not finite (frame 31)"}
 
-Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with one value per particle; set `.v`, `.held`
+Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with values of each or all; set `.v`, `.held`
 and `.model` afterwards, and join bodies with `solver.join_particles`. The caller keeps track of which body a particle
 belongs to: rows keep their order. Scenes have the same box, spacing, substep and colliders. On a GPU a scene takes
 about 52 bytes per node of the box, active or not, and 500 per particle: `Batch.fits` computes how many scenes fit.

@@ -75,25 +75,27 @@ class Particles:
 
 
 class ParticleMaterial(NamedTuple):
-    """Material constants of each particle."""
+    """Material constants of each particle, or of all."""
 
-    E: Float[Tensor, "p"]  # Young's modulus [Pa]
-    nu: Float[Tensor, "p"]  # Poisson ratio
-    density: Float[Tensor, "p"]  # at rest [kg/m^3]
-    viscosity: Float[Tensor, "p"]  # [Pa s]
-    friction: Float[Tensor, "p"]  # Coulomb coefficient against floor and walls
+    E: Float[Tensor, "p"] | float  # Young's modulus [Pa]
+    nu: Float[Tensor, "p"] | float  # Poisson ratio
+    density: Float[Tensor, "p"] | float  # at rest [kg/m^3]
+    viscosity: Float[Tensor, "p"] | float  # [Pa s]
+    friction: Float[Tensor, "p"] | float  # Coulomb coefficient against floor and walls
 
 
 def at_rest(
-    x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"], material: ParticleMaterial, model: int = NEO_HOOKEAN,
+    x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"] | float, material: ParticleMaterial, model: int = NEO_HOOKEAN,
     plastic: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Particles:  # fmt: skip
-    """Undeformed particles at `x` [m] without velocity, of the given `volume` [m^3].
+    """Undeformed particles at `x` [m] without velocity, of the given `volume` [m^3] each.
 
     `model` (number of the material model) and `plastic` (its parameters) apply to all; overwrite the fields for a
     mixture.
     """
-    p, (E, nu, density, viscosity, friction) = len(x), material
+    p = len(x)
+    each = (v if isinstance(v, Tensor) else torch.full((p,), float(v)) for v in (volume, *material))
+    volume, E, nu, density, viscosity, friction = each
     still, identity = torch.zeros(p, 3, 3), torch.eye(3).repeat(p, 1, 1)
     stiffness = torch.stack([E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), viscosity], -1)
     held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)

@@ -47,13 +47,13 @@ export function buildInterface(player) {
 
   options(element("colours"), MODES, moving || film.live ? MODES.length : 3);
   element("colours").selectedIndex = player.renderer.mode;
-  element("colours").onchange = (event) => player.setMode(event.target.selectedIndex);
+  element("colours").onchange = (event) => player.restyle({ mode: event.target.selectedIndex });
 
   options(element("view"), ["start", ...film.cameras.map((c) => c.name)]);
   element("view").onchange = (event) => player.showCamera(event.target.selectedIndex - 1);
 
   element("shadows-row").hidden = !film.light;
-  element("shadows").onchange = (event) => player.showShadows(event.target.checked);
+  element("shadows").onchange = (event) => player.restyle({ shadows: event.target.checked });
 
   element("arrows").checked = player.arrowsShown;
   element("arrows").onchange = (event) => player.showArrows(event.target.checked);

@@ -215,18 +215,13 @@ export class Player {
     this.updateObjects();
   }
 
-  setMode(mode) {
-    this.renderer.mode = mode;
+  restyle(changes) { // of the renderer: mode, shadows
+    Object.assign(this.renderer, changes);
     this.wake();
   }
 
   showArrows(shown) {
     this.arrowsShown = shown;
-    this.wake();
-  }
-
-  showShadows(shown) {
-    this.renderer.shadows = shown;
     this.wake();
   }
 

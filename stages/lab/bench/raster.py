@@ -44,12 +44,21 @@ class RasterBenchOptions:
 
 
 @dataclass(frozen=True)
-class RasterTiming:
-    """One comparison [ms]: wall time on `threads` threads and CPU time on one, ours and the baseline's."""
+class RasterCase:
+    """What is timed."""
 
     what: str
     gaussians: int
     pixels: int  # along a side of the image
+
+    def __str__(self) -> str:
+        return f"{self.what:<18}" + (f"{self.gaussians:>8,}" if self.gaussians else " " * 8) + f" {self.pixels:4d} px"
+
+
+@dataclass(frozen=True)
+class RasterTiming(RasterCase):
+    """One comparison [ms]: wall time on `threads` threads and CPU time on one, ours and the baseline's."""
+
     threads: int
     wall: float
     cpu: float
@@ -57,9 +66,8 @@ class RasterTiming:
     plain_cpu: float
 
     def __str__(self) -> str:
-        name = f"{self.what:<18}" + (f"{self.gaussians:>8,}" if self.gaussians else " " * 8)
         return (
-            f"{name} {self.pixels:4d} px: {self.wall:7.1f} ms on {self.threads} threads, {1e3 / self.wall:6.1f} a"
+            f"{super().__str__()}: {self.wall:7.1f} ms on {self.threads} threads, {1e3 / self.wall:6.1f} a"
             f" second; one thread {self.cpu:7.1f} ms; plain {self.plain_wall:7.1f} and {self.plain_cpu:7.1f} ms:"
             f" {self.plain_cpu / self.cpu:4.1f}x"
         )

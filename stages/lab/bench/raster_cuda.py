@@ -21,7 +21,7 @@ from stages.core.raster.rasterise import NEAR, count_pairs, rasterise_packed
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
-from stages.lab.bench.raster import FORWARD, RasterBenchOptions, random_gaussians, view_camera
+from stages.lab.bench.raster import FORWARD, RasterBenchOptions, RasterCase, random_gaussians, view_camera
 from stages.reconstruct.photometric import FitOptions, fit_gaussians
 from stages.reconstruct.photos import Views
 
@@ -31,12 +31,9 @@ FIT_STEPS = 50, 190  # fits of these lengths are compared; longer ones split Gau
 
 
 @dataclass(frozen=True)
-class CudaRasterTiming:
+class CudaRasterTiming(RasterCase):
     """One comparison [ms]: kernels and wall time of a call, ours and gsplat's."""
 
-    what: str
-    gaussians: int
-    pixels: int  # along a side of the image
     kernels: float
     wall: float
     gsplat_kernels: float
@@ -46,7 +43,7 @@ class CudaRasterTiming:
     def __str__(self) -> str:
         share = "" if self.arithmetic is None else f"; tests {100 * self.arithmetic:.0f} % of the float32 rate"
         return (
-            f"{self.what:<18}{self.gaussians:>8,} {self.pixels:4d} px: kernels {self.kernels:6.3f} ms, wall"
+            f"{super().__str__()}: kernels {self.kernels:6.3f} ms, wall"
             f" {self.wall:6.3f} ms; gsplat {self.gsplat_kernels:6.3f} and {self.gsplat_wall:6.3f} ms:"
             f" {self.gsplat_kernels / self.kernels:4.2f}x{share}"
         )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from ngff_cli.options import AsJson, Device, Seed, new_app, print_results
+from ngff_cli.options import AsJson, Device, Keypoints, SceneCount, Seed, new_app, print_results
 from stages.core.errors import InputError
 
 app = new_app()
@@ -18,7 +18,8 @@ OutWithTable = Annotated[
 ]
 Holdout = Annotated[int, Option(help="hold out every N-th photo")]
 Views = Annotated[int, Option(help="number of cameras per scene")]
-Keypoints = Annotated[int, Option(help="keypoints per object")]
+Workers = Annotated[int, Option(help="processes")]
+Quality = Annotated[str, Option(help="quality of the reconstruction")]
 Compiled = Annotated[bool, Option("--compiled", help="compile the training step first; for GPUs")]
 
 
@@ -68,7 +69,7 @@ def bench_raster(
 def bench_reconstruct(
     sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
     out: OutKept = Path("reconstruct.json"),
-    quality: Annotated[str, Option(help="quality of the reconstruction")] = "normal",
+    quality: Quality = "normal",
     holdout: Holdout = 8,
     device: Device = "auto",
     matcher: Annotated[str, Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
@@ -93,7 +94,7 @@ def bench_chain(
         bool,
         Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
     ] = False,
-    quality: Annotated[str, Option(help="quality of the reconstruction")] = "normal",
+    quality: Quality = "normal",
     device: Device = "auto",
     steps: Annotated[int, Option(help="frames of the video")] = 100,
     refine: Annotated[bool, Option(help="complete the objects before they are simulated")] = True,
@@ -146,7 +147,7 @@ def bench_track(
 def bench_appearance(
     sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
     out: OutKept = Path("appearance.json"),
-    quality: Annotated[str, Option(help="quality of the reconstruction")] = "high",
+    quality: Quality = "high",
     holdout: Holdout = 8,
     models: Annotated[
         Path | None, Option(help="folder in which cameras and sparse points are cached between runs")
@@ -416,12 +417,12 @@ def bench_complete(
 
 @app.command("fit")
 def bench_fit(
-    scenes: Annotated[int, Option(help="number of scenes")] = 20,
+    scenes: SceneCount = 20,
     only: Annotated[str, Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
     noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
     evaluations: Annotated[int, Option(help="largest number of simulations of a scene")] = 1500,
     minutes: Annotated[float, Option(help="longest time of a scene [min]")] = 10.0,
-    workers: Annotated[int, Option(help="processes")] = 2,
+    workers: Workers = 2,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -439,12 +440,12 @@ def bench_fit(
 
 @app.command("fit-films")
 def bench_fit_films(
-    scenes: Annotated[int, Option(help="number of scenes")] = 6,
+    scenes: SceneCount = 6,
     only: Annotated[str, Option(help="slide | throw; default: both, alternating")] = "",
     cameras: Annotated[int, Option(help="films per scene")] = 2,
     width: Annotated[int, Option(help="of the films [px]")] = 320,
     frames: Annotated[int, Option(help="of each film")] = 25,
-    workers: Annotated[int, Option(help="processes")] = 2,
+    workers: Workers = 2,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "auto",

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 from typer.models import OptionInfo
 
-from ngff_cli.options import AsJson, Device, Seed, print_results
+from ngff_cli.options import AsJson, Device, Keypoints, SceneCount, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer()
@@ -146,7 +146,7 @@ def statistics(
 @app.command()
 def study(
     out: Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")] = None,
-    scenes: Annotated[int, Option(help="number of scenes")] = 24,
+    scenes: SceneCount = 24,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -192,10 +192,10 @@ def backgrounds(
 def heldout(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
     meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
-    scenes: Annotated[int, Option(help="number of scenes")] = 100,
+    scenes: SceneCount = 100,
     objects: Annotated[int, Option(help="objects per scene")] = 3,
     frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, Option(help="keypoints per object")] = 2048,
+    keypoints: Keypoints = 2048,
     dx: Dx = 0.02,
     spacing: ParticleSpacing = 0.009,
     substep: Substep = 1e-4,
@@ -223,7 +223,7 @@ def heldout(
 def clutter(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
     meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
-    count: Annotated[int, Option(help="number of scenes")] = 20,
+    count: SceneCount = 20,
     first: Annotated[int, Option(help="number of the first scene")] = 0,
     photos: Annotated[int, Option(help="photos of each scene")] = 12,
     size: Annotated[int, Option(help="longest side of a photo [px]")] = 512,

@@ -25,6 +25,8 @@ Seed = Annotated[
 Threads = Annotated[int | None, typer.Option(
     help="CPU threads; default: all cores. With OMP_WAIT_POLICY=ACTIVE in the environment waiting threads spin: faster "
          "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
+SceneCount = Annotated[int, typer.Option(help="number of scenes")]
+Keypoints = Annotated[int, typer.Option(help="keypoints per object")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip

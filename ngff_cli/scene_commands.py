@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from typer import Argument, Option
+from typer.models import OptionInfo
 
 from ngff_cli.options import QUALITY_HELP, Device, SceneIn, Seed
 from stages.core.backends import describe, load
@@ -15,6 +16,16 @@ from stages.refine.options import GENERATORS, UPSCALERS, RefineOptions
 from stages.refine.options import MATCHERS as REFINE_MATCHERS
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import NETWORKS, SegmentOptions
+
+
+def photos_option(backends: str) -> OptionInfo:
+    """The option --photos of a command, of which these backends read photos."""
+    return Option(help=f"for {backends}: folder of the scene's photos; default: rendered images")
+
+
+def download_option(backends: str) -> OptionInfo:
+    """The option --download of a command, of which these backends have published weights."""
+    return Option("--download", help=f"for {backends}: download missing weights, after logging size and licence")
 
 
 def reconstruct(
@@ -123,9 +134,7 @@ def segment(
             "repeatable; points of one name are on one object"
         ),
     ] = None,
-    photos: Annotated[
-        Path | None, Option(help=f"for {NETWORKS}: folder of the scene's photos; default: rendered images")
-    ] = SegmentOptions.photos,
+    photos: Annotated[Path | None, photos_option(NETWORKS)] = SegmentOptions.photos,
     undistorted: Annotated[
         bool,
         Option(
@@ -139,9 +148,7 @@ def segment(
             "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours"
         ),
     ] = SegmentOptions.weights,
-    download: Annotated[
-        bool, Option("--download", help=f"for {NETWORKS}: download missing weights, after logging size and licence")
-    ] = SegmentOptions.download,
+    download: Annotated[bool, download_option(NETWORKS)] = SegmentOptions.download,
     names: Annotated[str, Option(help='object names: "1=duck,2=bowl"')] = SegmentOptions.names,
     max_objects: Annotated[int, Option(help="maximum number of objects")] = SegmentOptions.max_objects,
     min_size: Annotated[
@@ -172,15 +179,11 @@ def refine(
     library: Annotated[
         Path | None, Option(help="folder of complete objects (.ply); the best match replaces a partial object")
     ] = RefineOptions.library,
-    photos: Annotated[
-        Path | None, Option(help=f"for {GENERATORS}: folder of the scene's photos; default: rendered images")
-    ] = RefineOptions.photos,
+    photos: Annotated[Path | None, photos_option(GENERATORS)] = RefineOptions.photos,
     weights: Annotated[
         Path | None, Option(help=f"for {GENERATORS}: folder of its weights; default: searched in $NGFF_WEIGHTS")
     ] = RefineOptions.weights,
-    download: Annotated[
-        bool, Option("--download", help=f"for {GENERATORS}: download missing weights, after logging size and licence")
-    ] = RefineOptions.download,
+    download: Annotated[bool, download_option(GENERATORS)] = RefineOptions.download,
     upscale: Annotated[
         str, Option(help=f"for {GENERATORS}, super-resolution of the object's image; {describe(UPSCALERS)}")
     ] = RefineOptions.upscale,

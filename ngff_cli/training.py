@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ngff_cli.options import Device, Seed
+from ngff_cli.options import Device, Keypoints, Seed
 
 app = typer.Typer()
 
+LearningRate = Annotated[float, Option(help="maximum learning rate")]
 Half = Annotated[bool, Option("--half", help="also store the weights in 16 bits, for the package")]
 
 
@@ -21,11 +22,11 @@ def train(
     minutes: Annotated[float, Option(help="training time [min]")] = 20.0,
     steps: Annotated[int, Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
     batch: Annotated[int, Option(help="scenes per step")] = 32,
-    keypoints: Annotated[int, Option(help="keypoints per object")] = 256,
+    keypoints: Keypoints = 256,
     sparse_keypoints: Annotated[
         int, Option(help="keypoints per object in every fourth step; 0: the same in all steps")
     ] = 0,
-    lr: Annotated[float, Option(help="maximum learning rate")] = 1e-3,
+    lr: LearningRate = 1e-3,
     width: Annotated[int, Option(help="width of the network, may exceed that of --from; 0: the model's default")] = 0,
     horizons: Annotated[str, Option(help="rollout length of each phase [frames]")] = "8,20,40",
     loss: Annotated[
@@ -107,7 +108,7 @@ def train_splatter(
     width: Annotated[
         int, Option(help="width of a small random network that replaces the weights, for tests; 0: none")
     ] = 0,
-    lr: Annotated[float, Option(help="maximum learning rate")] = 1e-4,
+    lr: LearningRate = 1e-4,
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
@@ -129,7 +130,7 @@ def train_segmenter(
         float, Option(help="training time of the network [min]; 0: train only the candidate scores")
     ] = 30.0,
     steps: Annotated[int, Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
-    rate: Annotated[float, Option(help="maximum learning rate")] = 2e-3,
+    rate: LearningRate = 2e-3,
     voxels: Annotated[int, Option(help="largest number of voxels of a training crop")] = 14_000,
     batch: Annotated[int, Option(help="crops per step")] = 1,
     workers: Annotated[int, Option(help="processes that prepare crops; 0: the training process itself")] = 0,

@@ -15,7 +15,7 @@ from stages.simulate.options import AUTO, SimulateOptions
 
 log = logging.getLogger(__name__)
 MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
-MAX_SOLVED_SAG = 0.027  # the same of a body with solved contacts: of undeformed surfaces, so that dents of 5 % stay open
+MAX_SOLVED_SAG = 0.027  # the same of a body with solved contacts, whose dents then leave gaps of 5 % of its height
 MAX_RIGID_IMPACT = 0.1  # largest compression by its own impact; that of which `plausibility.py` warns
 NO_PROMPTS = ForcePrompts()
 

@@ -28,11 +28,6 @@ class InitialOverlaps:
             self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
         self._bodies = model.geom_bodyid[self._pairs]
 
-    def distances(self, data) -> np.ndarray:
-        """Those of the contacts (k,) beyond the allowed overlaps."""
-        row = self._row[tuple(data.contact.geom.T)]
-        return data.contact.dist + np.append(self.allowed, 0.0)[row]  # the last for those that have none, -1
-
     def subtract(self, data, fixed: np.ndarray, count: int) -> None:
         """Subtract the allowed overlaps from the first `count` contacts; `fixed` masks bodies that do not move.
 

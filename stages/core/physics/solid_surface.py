@@ -67,15 +67,17 @@ class SolidSurface:
 
     @cached_property
     def fitted(self) -> SolidSurface:
-        """The same with the planes that fit the neighbours of each sample on the same face.
+        """The same with one sample a voxel, on the plane that fits the samples around it on its face.
 
         By iteratively reweighted least squares, so that the planes of samples at an edge are those of one face.
         """
         out = copy.copy(self)
         vars(out).pop("_depth_grid", None)  # of the other samples
-        distance, row = self._tree.query(self.points, NEIGHBOURS + 1)
+        chosen = self.thinned()
+        points, outward = self.points[chosen], self.normals[chosen]
+        distance, row = self._tree.query(points, NEIGHBOURS + 1)
         distance, row = distance[:, :-1] / distance[:, -1:], np.minimum(row[:, :-1], len(self.points) - 1)
-        along = (self.normals[row] * self.normals[:, None]).sum(-1)
+        along = (self.normals[row] * outward[:, None]).sum(-1)
         near = np.where(along > 0, (1 - distance**2).clip(1e-9), 0.0)  # 0 where the set of neighbours changes
         same_face = along > SAME_FACE
         weight = np.where((same_face.sum(1) >= MIN_ON_FACE)[:, None], near * same_face, near)
@@ -85,8 +87,8 @@ class SolidSurface:
             height = ((around - middle[:, None]) * normals[:, None]).sum(-1)
             spread = np.sqrt((weight * height**2).sum(1) / weight.sum(1)).clip(FLATNESS * self.spacing)
             weight = near * np.exp(-((height / spread[:, None]) ** 2))
-        normals *= np.where((normals * self.normals).sum(1, keepdims=True) < 0, -1, 1)
-        out.points = self.points + ((middle - self.points) * normals).sum(1, keepdims=True) * normals
+        normals *= np.where((normals * outward).sum(1, keepdims=True) < 0, -1, 1)
+        out.points = points + ((middle - points) * normals).sum(1, keepdims=True) * normals
         out.normals = normals
         out._tree = cKDTree(out.points)
         return out

@@ -201,12 +201,17 @@ def heldout(
     substep: Substep = 1e-4,
     size: Annotated[float, Option(help="longest side of a mesh [m]")] = 0.5,
     shapes: Annotated[
-        int, Option(help="number of random objects for training, written as the group varied; 0: none")
+        int,
+        Option(
+            help="number of random objects for training, written as the group varied (with --from made of its meshes: "
+            "the group meshes); 0: none"
+        ),
     ] = 0,
     solid: Annotated[bool, Option("--solid", help="fill the random objects: the group solid")] = False,
     rotations: Annotated[
         int, Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
     ] = 0,
+    seed: Annotated[int, Option(help="of scenes and random objects; other than 0: ends the group's name", min=0)] = 0,
     device: Device = "auto",
 ) -> None:
     """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
@@ -214,7 +219,7 @@ def heldout(
 
     options = HeldoutOptions(
         scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        size=size, shapes=shapes, solid=solid, rotations=rotations, device=device,
+        size=size, shapes=shapes, solid=solid, rotations=rotations, seed=seed, device=device,
     )  # fmt: skip
     print(run(out, options, meshes))
 

@@ -5,48 +5,31 @@
     OUT/particles_heldout.npz          the objects as particles, cached for the next run
 
 The groups for training are `varied`: random hollow shapes (the ten are hollow too); `solid`: filled random shapes,
-like the bodies simulated from photos; and `turned`: the ten, each randomly rotated, which they never are in the data
-set.
+like the bodies simulated from photos; `turned`: the ten, each randomly rotated, which they never are in the data set;
+and `meshes`: meshes of random size and material. With another seed than 0 it ends a group's name (`varied_1`).
 """
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.geometry.rotations import matrix
-from stages.core.models.field.solidity import solidity
-from stages.core.physics.keypoints import farthest_points
-from stages.core.physics.materials import choose_materials
 from stages.core.scene.files import provenance
-from stages.core.scene.scene import SceneObject
-from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_and_interior_points, surface_points
-from stages.lab.assets.mesh_files import find_objects, object_name
+from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES
+from stages.lab.assets.mesh_files import find_objects
 from stages.lab.assets.random_shapes import random_shapes
-from stages.lab.assets.shapes import single_threaded
-from stages.lab.dataset import object_particles
+from stages.lab.dataset import extra_objects, object_particles
 from stages.lab.dataset.keypoint_motions import KeypointMotionsWriter
-from stages.lab.dataset.object_particles import (
-    SUBSTEP,
-    Asset,
-    Discretisation,
-    count_for_spacing,
-    particle_volumes,
-    placement_extents,
-)
+from stages.lab.dataset.object_particles import SUBSTEP, Asset, Discretisation, placement_extents
 from stages.lab.dataset.scene_configs import (
     HELDOUT,
+    MESHES,
     ROTATED,
     SOLID,
     VARIED,
@@ -56,13 +39,10 @@ from stages.lab.dataset.scene_configs import (
 )
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
-log = logging.getLogger(__name__)
-FIRST_SCENE = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, ROTATED: 40_000}  # index, and seed, of the first scene
+# index, and seed, of the first scene
+FIRST_SCENE = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, ROTATED: 40_000, MESHES: 50_000}
+SCENES_PER_SEED = 100_000
 SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of random shapes
-FIRST_MESH_ID, FIRST_ROTATED_ID = 100, 2000  # object ids
-PARTICLES_PER_CELL_AXIS = 1.5  # of solid bodies
-SURFACE_POINTS = 30_000  # of a shape, from which particles are sampled
-MAX_YOUNG = 2e7  # of a mesh, as of the stiffest of the ten (phone): hardly deforms, and substeps stay affordable [Pa]
 
 
 @dataclass(frozen=True)
@@ -77,9 +57,10 @@ class HeldoutOptions:
     spacing: float = 0.009  # between particles on a surface [m]
     substep: float = SUBSTEP  # the longest; shorter for objects that are too stiff for it [s]
     size: float = 0.5  # longest side of a mesh [m]
-    shapes: int = 0  # random shapes and materials, instead of the eight
+    shapes: int = 0  # random shapes, or meshes of random size, and materials, instead of the eight
     solid: bool = False  # fill the random shapes
     rotations: int = 0  # random rotations of the ten objects, instead of the eight
+    seed: int = 0  # of scenes and random objects
     device: str = "auto"
 
     def __post_init__(self):
@@ -94,10 +75,10 @@ class HeldoutOptions:
         if not 0.1 <= self.size <= 1.0:
             raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
 
-    @property
-    def group(self) -> str:
-        """Name of the group of scenes."""
-        return SOLID if self.solid else VARIED if self.shapes else ROTATED if self.rotations else HELDOUT
+    def group(self, meshes: bool) -> str:
+        """Kind of the group of scenes, of meshes or not."""
+        random = MESHES if meshes else SOLID if self.solid else VARIED
+        return random if self.shapes else ROTATED if self.rotations else HELDOUT
 
     @property
     def discretisation(self) -> Discretisation:
@@ -108,27 +89,29 @@ class HeldoutOptions:
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
     """Write one group of scenes and return a one-line summary; an existing group is kept.
 
-    `meshes` are files and folders. Raises InputError when they are combined with --shapes or --rotations, or a mesh
+    `meshes` are files and folders. Raises InputError when they are combined with --solid or --rotations, or a mesh
     cannot be read.
     """
-    group = options.group
-    file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
-    if meshes and (options.shapes or options.rotations):
-        raise InputError("--from cannot be combined with --shapes or --rotations")
+    group = options.group(bool(meshes))
+    name = f"{group}_{options.seed}" if options.seed else group
+    file, motions = Path(out) / "scene_configs" / f"{name}.json", Path(out) / "motions" / f"{name}.h5"
+    if meshes and (options.solid or options.rotations):
+        raise InputError("--from cannot be combined with --solid or --rotations")
     if motions.exists():
         return f"{motions}: exists already"
     for folder in (file.parent, motions.parent):
         folder.mkdir(parents=True, exist_ok=True)
     device, start = pick_device(options.device), time.perf_counter()
     objects = find_objects(meshes or [])
-    assets = _assets(options, objects, Path(out) / f"particles_{group}.npz")
+    assets = _assets(options, objects, Path(out) / f"particles_{name}.npz")
     materials = [(asset.E, asset.density) for asset in assets.values()]
     options = replace(options, substep=stable_substep(options.discretisation, materials))
-    configs = sample_configs(assets, options.scenes, options.objects, FIRST_SCENE[group])
+    first = FIRST_SCENE[group] + SCENES_PER_SEED * options.seed
+    configs = sample_configs(assets, options.scenes, options.objects, first)
     write_scene_configs(file, configs)
     made_by, count = provenance("heldout", [file, *(path for files in objects for path in files)], options), 0
     settings = SimulationSettings(options.discretisation, options.frames, options.keypoints, device)
-    bar = tqdm(total=len(configs), desc=group, unit="scene")
+    bar = tqdm(total=len(configs), desc=name, unit="scene")
     with bar, KeypointMotionsWriter(motions, made_by) as writer:
         for batch in simulate(configs, assets, settings):
             writer.append(batch)
@@ -140,13 +123,18 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
 
 def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Path) -> dict[int, Asset]:
     """The objects that the options choose."""
+    how, seed = (options.discretisation, options.keypoints), options.seed
+    if meshes and options.shapes:
+        return extra_objects.random_mesh_assets(meshes, options.shapes, *how, seed, cache)
     if meshes:
-        return mesh_assets(meshes, options)
+        return extra_objects.mesh_assets(meshes, options.size, *how)
     if options.rotations:
-        ten = object_particles.load_assets(options.discretisation, options.keypoints, cache)
-        return rotated_assets(ten, options.rotations, options.discretisation)
-    shapes = random_shapes(options.shapes, SHAPE_SEEDS[options.group]) if options.shapes else HELDOUT_SHAPES
-    return load_shape_assets(shapes, options.discretisation, options.keypoints, cache, options.solid)
+        ten = object_particles.load_assets(*how, cache)
+        return extra_objects.rotated_assets(ten, options.rotations, options.discretisation, seed)
+    shapes = HELDOUT_SHAPES
+    if options.shapes:
+        shapes = random_shapes(options.shapes, SHAPE_SEEDS[options.group(False)] + len(SHAPE_SEEDS) * seed)
+    return extra_objects.load_shape_assets(shapes, *how, cache, options.solid)
 
 
 def sample_configs(
@@ -156,83 +144,3 @@ def sample_configs(
     extents = placement_extents(assets)
     configs = (sample_scene(first + i, objects, extents) for i in tqdm(range(scenes), desc="placing", unit="scene"))
     return {c.name: c for c in configs}
-
-
-def rotated_assets(assets: Mapping[int, Asset], count: int, discretisation: Discretisation) -> dict[int, Asset]:
-    """`count` randomly rotated copies of the objects in turn, with new ids."""
-    made = {}
-    for i in range(count):
-        asset = list(assets.values())[i % len(assets)]
-        R = matrix(torch.from_numpy(np.random.default_rng([FIRST_ROTATED_ID, i]).normal(size=4)).float())
-        points = asset.points @ R.T
-        points = points - (points.amin(0) + points.amax(0)) / 2
-        id = FIRST_ROTATED_ID + i
-        made[id] = replace(asset, id=id, points=points, volume=particle_volumes(points, discretisation.dx))
-    return made
-
-
-def load_shape_assets(
-    shapes: Mapping[str, ShapeKind], discretisation: Discretisation, min_particles: int, cache: Path | None = None,
-    solid: bool = False,
-) -> dict[int, Asset]:  # fmt: skip
-    """Objects of signed distance fields by id; `cache` is a file (.npz) of their particles, read or written.
-
-    Each has at least `min_particles` surface particles, and with `solid` interior ones after them.
-    """
-    key = f"spacing {discretisation.spacing} least {min_particles}" + f" dx {discretisation.dx}" * solid
-
-    def sample() -> dict[str, Tensor]:
-        bar = tqdm(shapes.items(), desc="objects", unit="object")
-        return {name: _shape_particles(kind, discretisation, min_particles, solid) for name, kind in bar}
-
-    points = object_particles.cached_points(cache, key, shapes, sample)
-    made = {kind.id: _asset(kind.id, kind.scale, points[name], (kind.E, kind.density), discretisation)
-            for name, kind in shapes.items()}  # fmt: skip
-    if not solid:
-        return made
-    return {i: replace(a, solidity=solidity(a.points[:min_particles], float(a.volume.sum()))) for i, a in made.items()}
-
-
-def mesh_assets(meshes: Sequence[Sequence[Path]], options: HeldoutOptions) -> dict[int, Asset]:
-    """Meshes, each of one or several files, as objects 100, 101, ...; file and folder names choose the materials."""
-    from stages.lab.assets.meshes import read_mesh  # needs an optional extra
-
-    assets = {}
-    for id, files in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):
-        name = f"{files[0].resolve().parent.name} {object_name(files)}"
-        choice = choose_materials([SceneObject(id, name)])[id]
-        E = min(choice.material.E, MAX_YOUNG)
-        log.info("%s: %s%s, E %.3g Pa", name, choice.name, " (a guess)" * choice.guessed, E)
-        points = options.size * read_mesh(files, SURFACE_POINTS).means
-        points = _sample_points(points, options.discretisation, options.keypoints)
-        assets[id] = _asset(id, options.size, points, (E, choice.material.density), options.discretisation)
-    return assets
-
-
-def _shape_particles(
-    kind: ShapeKind, discretisation: Discretisation, min_particles: int, solid: bool
-) -> Float[Tensor, "p 3"]:
-    """Particles of the surface, and with `solid` those of the interior after them."""
-    if not solid:
-        return _sample_points(kind.scale * surface_points(kind, SURFACE_POINTS), discretisation, min_particles)
-    spacing = discretisation.dx / PARTICLES_PER_CELL_AXIS / kind.scale
-    surface, interior = surface_and_interior_points(kind, SURFACE_POINTS, spacing)
-    return torch.cat([_sample_points(kind.scale * surface, discretisation, min_particles), kind.scale * interior])
-
-
-def _sample_points(
-    points: Float[Tensor, "n 3"], discretisation: Discretisation, min_particles: int
-) -> Float[Tensor, "p 3"]:
-    """Some of the points, by farthest-point sampling."""
-    if len(points) < min_particles:
-        raise InputError(f"--keypoints {min_particles}: an object has only {len(points)} surface points")
-    count = min(len(points), max(min_particles, count_for_spacing(points, discretisation.spacing)))
-    with single_threaded():
-        return points[farthest_points(points, count)]
-
-
-def _asset(
-    id: int, scale: float, points: Tensor, material: tuple[float, float], discretisation: Discretisation
-) -> Asset:
-    """An object of particles; `material` is Young's modulus [Pa] and density [kg/m^3]."""
-    return Asset(id, scale, points, particle_volumes(points, discretisation.dx), *material)

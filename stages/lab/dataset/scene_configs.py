@@ -28,8 +28,9 @@ MAX_OFFSET = 0.1  # horizontal, from the object placed before, in scenes of up t
 MAX_PLACEMENTS = 500  # attempts to place an object before its scene is drawn again
 MAX_DRAWS = 200  # of the objects of a scene
 HELDOUT = "heldout"  # group of scenes of eight other objects that are never trained on
-VARIED, SOLID, ROTATED = "varied", "solid", "turned"  # groups of random shapes, solid random shapes, rotated objects
-EXTRA_GROUPS = (VARIED, SOLID, ROTATED)  # unpublished groups that may be trained on
+# groups of random shapes, solid random shapes, rotated objects, and objects made from meshes
+VARIED, SOLID, ROTATED, MESHES = "varied", "solid", "turned", "meshes"
+EXTRA_GROUPS = (VARIED, SOLID, ROTATED, MESHES)  # unpublished groups that may be trained on; also varied_1, ...
 MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of three objects, for training
 SCENE_NAME = re.compile(r"[\w-][\w.-]{0,199}")  # no separators, not hidden, not ".."
 SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # scenes in each group
@@ -95,7 +96,7 @@ def object_count(group: str) -> int:
 
 
 def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
-    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are further names allowed.
+    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are further names allowed, also with a number.
 
     Raises InputError for an unknown group.
     """
@@ -104,7 +105,7 @@ def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
         span = re.fullmatch(r"(\w+)_(\d)\.\.\1_(\d)", part.strip())
         names = [f"{span[1]}_{i}" for i in range(int(span[2]), int(span[3]) + 1)] if span else [part.strip()]
         for name in names:
-            if name not in more:
+            if re.sub(r"_\d+$", "", name) not in more:
                 object_count(name)
             if name not in out:
                 out.append(name)

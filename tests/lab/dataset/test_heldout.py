@@ -13,8 +13,9 @@ from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.random_shapes import random_shapes
 from stages.lab.assets.signed_distance import ellipsoid
-from stages.lab.dataset import heldout
-from stages.lab.dataset.heldout import HeldoutOptions, load_shape_assets, rotated_assets, run, sample_configs
+from stages.lab.dataset import extra_objects, object_particles
+from stages.lab.dataset.extra_objects import load_shape_assets, random_mesh_assets, rotated_assets
+from stages.lab.dataset.heldout import HeldoutOptions, run, sample_configs
 from stages.lab.dataset.keypoint_motions import read_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
 from stages.lab.dataset.scene_configs import EXTRA_GROUPS, HELDOUT, parse_groups, read_scene_configs
@@ -56,7 +57,7 @@ def test_ball_is_round_and_knot_is_connected():
 def cache(tmp_path_factory):
     """Cached particles of all shapes, sampled from few points."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(heldout, "SURFACE_POINTS", 2000)
+        patch.setattr(extra_objects, "SURFACE_POINTS", 2000)
         path = tmp_path_factory.mktemp("held") / "p.npz"
         load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, path)
     return path
@@ -79,7 +80,7 @@ def test_scenes_are_sampled_as_in_the_data_set(assets):
 
 
 def test_group_is_written_once(assets, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "load_shape_assets", lambda *_: assets)
+    monkeypatch.setattr(extra_objects, "load_shape_assets", lambda *_: assets)
     options = HeldoutOptions(scenes=2, **COARSE)
     assert "2 scenes of 8 objects" in run(tmp_path, options)
     made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
@@ -96,7 +97,7 @@ def test_group_is_written_once(assets, tmp_path, monkeypatch):
 
 
 def test_particles_are_cached(assets, cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "_shape_particles", None)  # must not be called
+    monkeypatch.setattr(extra_objects, "_shape_particles", None)  # must not be called
     again = load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, cache)
     assert all(torch.equal(assets[i].points, again[i].points) for i in assets) and len(again) == 8
     (tmp_path / "p.npz").write_text("no")
@@ -154,6 +155,34 @@ def test_a_folder_of_stiff_meshes_is_simulated_without_loss(tmp_path):
     assert (start - end).abs().max() < 0.05  # no object breaks
 
 
+def test_meshes_become_a_training_group_of_random_sizes_and_materials(tmp_path, monkeypatch):
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setattr(extra_objects, "SURFACE_POINTS", 2000)
+    trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "box.obj")
+    trimesh.creation.icosphere(2).export(tmp_path / "globe.stl")
+    meshes = [(tmp_path / "box.obj",), (tmp_path / "globe.stl",)]
+    cache = tmp_path / "cache.npz"
+    made = random_mesh_assets(meshes, 6, DISCRETISATION, 40, cache=cache)
+    again = random_mesh_assets(meshes, 6, DISCRETISATION, 40, cache=cache)
+    other = random_mesh_assets(meshes, 6, DISCRETISATION, 40, seed=1)
+    assert [a.E for a in made.values()] == [a.E for a in again.values()] != [a.E for a in other.values()]
+    assert all(torch.equal(a.points, again[i].points) for i, a in made.items())
+    for i, a in enumerate(made.values()):
+        assert 0.25 <= a.scale <= 0.8 and 100 <= a.density <= 2700 and a.E <= 2e7
+        assert (torch.cdist(a.points, a.points).amax() >= 0.9 * a.scale) and (
+            a.points.amax(0) + a.points.amin(0)
+        ).norm() < 0.1
+        if i % 2 == 0:  # not rotated
+            assert float((a.points.amax(0) - a.points.amin(0)).amax()) == pytest.approx(a.scale, rel=0.1)
+    assert len({round(a.scale, 6) for a in made.values()}) == 6
+    options = HeldoutOptions(scenes=2, objects=2, shapes=4, seed=1, **(COARSE | {"frames": 4}))
+    assert "2 scenes of 4 objects" in run(tmp_path, options, [tmp_path])
+    assert bool((read_motions(tmp_path / "motions" / "meshes_1.h5").objects >= 3000).all())
+    assert parse_groups("meshes,meshes_1..meshes_2", more=EXTRA_GROUPS) == ["meshes", "meshes_1", "meshes_2"]
+    with pytest.raises(InputError, match="--solid or --rotations"):
+        run(tmp_path, HeldoutOptions(rotations=2), [tmp_path])
+
+
 def test_random_shapes_are_reproducible_and_within_the_range_of_the_ten():
     table = random_shapes(18)
     assert [k.E for k in random_shapes(5).values()] == [k.E for k in table.values()][:5]
@@ -168,7 +197,7 @@ def test_random_shapes_are_reproducible_and_within_the_range_of_the_ten():
 
 
 def test_random_shapes_become_a_training_group(tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
+    monkeypatch.setattr(extra_objects, "SURFACE_POINTS", 2000)
     assert "2 scenes of 3 objects" in run(tmp_path, HeldoutOptions(scenes=2, shapes=3, **COARSE))
     made = read_motions(tmp_path / "motions" / "varied.h5")
     assert made.points.shape == (2, 3, 3, 40, 3) and bool((made.objects >= 1000).all())
@@ -179,7 +208,7 @@ def test_random_shapes_become_a_training_group(tmp_path, monkeypatch):
 
 def test_solid_shapes_are_filled_and_have_the_mass_of_their_volume(tmp_path, monkeypatch):
     """The keypoints remain those of the surface."""
-    monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
+    monkeypatch.setattr(extra_objects, "SURFACE_POINTS", 2000)
     kind = ShapeKind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
     ball = load_shape_assets({"ball": kind}, Discretisation(0.04, 0.03, 5e-4), 40, solid=True)[7]
     assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
@@ -213,7 +242,7 @@ def test_rotated_objects_keep_shape_and_material(tmp_path, monkeypatch):
         torch.testing.assert_close(torch.cdist(a.points, a.points), torch.cdist(box, box), atol=1e-3, rtol=0)
     one, other = made[2000].points, made[2002].points
     assert (one - one.mean(0) - (other - other.mean(0))).norm(dim=1).mean() > 0.05
-    monkeypatch.setattr(heldout.object_particles, "load_assets", lambda *_: ten)
+    monkeypatch.setattr(object_particles, "load_assets", lambda *_: ten)
     assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, rotations=4, **COARSE))
     assert bool((read_motions(tmp_path / "motions" / "turned.h5").objects >= 2000).all())
 

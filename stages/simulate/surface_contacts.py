@@ -26,15 +26,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from stages.core.geometry.surface_faces import CURVED, FACES, OPPOSED, nearest_points, surface_faces
 from stages.core.kernels.depth_lookup import depth_lookup, turned
 from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface
-from stages.core.physics.surface_faces import FACES, nearest_points, surface_faces
 from stages.simulate.initial_overlaps import WINDOW
 
 FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
-OPPOSED = 0.9  # least cosine of the angle at which two faces are parallel, at the edges of both
-CURVED = 5e-4  # difference of the flatness of surfaces that counts: a plane has 1, a ball of 2000 samples .998
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
 BALL_NODES = 20  # along its radius: depths between them are interpolated to .001 radii

@@ -1,6 +1,7 @@
 """Signed distances to the surfaces of undeformed bodies."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,3 +59,18 @@ def test_without_a_surface_the_faces_of_voxels_bound_the_body():
     middle = np.array([[0.15, 0.15, z] for z in (0.05, 0.15, 0.25, 0.35)])
     assert at(shape.distance, shape, middle) == pytest.approx([-0.05, -0.05, 0.05, 0.15])
     assert shape.scaled(2.0).distance.max() == pytest.approx(2 * shape.distance.max())
+
+
+def test_the_surface_does_not_depend_on_where_an_object_is():
+    """Voxels begin at the object's bounds: moved by any part of a voxel, depths at its points are the same."""
+    depths = []
+    x = np.random.default_rng(0).uniform(-0.25, 0.25, (3000, 3))
+    for offset in ((0.0, 0.0, 0.0), (0.0031, 0.0, -0.0017), (0.7, -1.3, 0.0043)):
+        surface = box(tuple(SIDES.tolist()), 0.01)
+        g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
+        g = replace(g, means=g.means + torch.tensor(offset))
+        solid = solid_surface(Scene(g, (SceneObject(1, "body"),), None, None), 1).fitted
+        depths.append(solid.depth(x + offset))
+    assert np.abs(depths[0]).max() > 0.05
+    for other in depths[1:]:
+        assert np.abs(other - depths[0]).max() < 0.02 * solid.h

@@ -44,6 +44,15 @@ def test_weights_of_fewer_points_than_neighbours():
     torch.testing.assert_close(same, torch.full((1, 4), 0.25))  # all at one place
 
 
+def test_rounding_does_not_choose_between_points_that_are_equally_far():
+    """On a lattice most distances are equal; moved and rescaled by what only rounds, the same points are taken."""
+    lattice = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
+    chosen = farthest_points(lattice, 60)
+    assert len(chosen.unique()) == 60
+    for scale, offset in ((1 / 3, 0.0), (0.07, 0.3), (1.7, -20.0)):
+        assert torch.equal(farthest_points(lattice * scale + offset, 60), chosen), (scale, offset)
+
+
 def test_keypoints_are_among_the_usable_gaussians_without_outliers():
     line = torch.cat([torch.linspace(0, 1, 41)[:, None], torch.zeros(41, 2)], 1)
     g = splats(torch.cat([line, torch.tensor([[500.0, 0, 0]])]))

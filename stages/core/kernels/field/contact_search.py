@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from stages.core.geometry import surface_faces as faces
 from stages.core.kernels.field.groups import wait_for_group
 
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
@@ -22,9 +23,7 @@ GAP_WEIGHT = wp.constant(10.0)  # of a gap against the distance along a directio
 MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the way of a step [m]; a tenth of an object
 # Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
 MIN_FACING = wp.constant(0.3)
-OPPOSED = wp.constant(0.9)  # least cosine of the angle at which two faces are parallel, at the edges of both
-CURVED = wp.constant(5.0e-4)  # difference of flatness that counts: a plane has 1, a ball of 2000 points .998
-FACES = wp.constant(3)  # at a point of a surface
+OPPOSED, CURVED, FACES = wp.constant(faces.OPPOSED), wp.constant(faces.CURVED), wp.constant(faces.FACES)
 STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
 CLOSEST_POINT_STEPS = wp.constant(3)  # to the point of a ball that is nearest to a surface
 

@@ -16,6 +16,8 @@ AROUND = 24  # nearest points among which the faces at an edge or a corner are
 SAME_FACE = 0.9  # least cosine between normals of one face
 NEAR = 4  # edges of a grid from the surface up to which the nearest point is looked for
 FACES = 3  # that meet in a corner, at most
+OPPOSED = 0.9  # least cosine of the angle at which the faces of two surfaces are parallel, at the edges of both
+CURVED = 5e-4  # difference of flatness that counts: a plane has 1, a ball of 2000 points .998
 
 
 def surface_faces(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

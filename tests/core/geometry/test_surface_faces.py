@@ -1,0 +1,69 @@
+"""Faces that meet at points of a surface."""
+
+import numpy as np
+import pytest
+
+from stages.core.geometry.surface_faces import nearest_points, surface_faces
+
+SIDES = np.array([1.0, 0.8, 0.6])
+
+
+def box_points(spacing: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of a box around the origin, of a lattice, and normals: at edges and corners between the faces'."""
+    axes = [np.linspace(-0.5, 0.5, round(s / spacing) + 1) * s for s in SIDES]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    outward = np.where(np.isclose(np.abs(x), SIDES / 2), np.sign(x), 0.0)
+    on = outward.any(1)
+    return x[on], outward[on] / np.linalg.norm(outward[on], axis=1, keepdims=True)
+
+
+def test_faces_of_a_box_at_its_faces_edges_and_corners():
+    points, normals = box_points()
+    flatness, faces = surface_faces(points, normals)
+    meeting = np.isclose(np.abs(points), SIDES / 2)  # which of the three faces each point is on
+    count = meeting.sum(1)
+    inner = (np.abs(points) < SIDES / 2 - 0.11).sum(1) == 2  # away from the edges
+    assert inner.sum() > 500 and (flatness[inner] == pytest.approx(1)) and not flatness[count > 1].any()
+    assert np.array_equal(faces[inner, 0], normals[inner]) and not faces[inner, 1:].any()
+    clear = ((np.abs(points) < SIDES / 2 - 0.16) | meeting).all(1)  # of other edges and corners
+    for k in (2, 3):
+        mine = clear & (count == k)
+        found = faces[mine]
+        assert mine.sum() == {2: 4 * (13 + 9 + 5), 3: 8}[k]
+        assert ((np.linalg.norm(found, axis=2) > 0).sum(1) == k).all()
+        there = np.where(meeting, np.sign(points), 0.0)[mine]
+        assert np.abs(found).max(1) == pytest.approx(np.abs(there))  # each axis once, with
+        assert found.sum(1) == pytest.approx(there)  # its sign
+
+
+def test_points_of_a_sheet_are_on_the_face_of_their_side():
+    x, y = np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21))
+    side = np.repeat([1.0, -1.0], x.size)
+    points = np.column_stack([np.tile(x.ravel(), 2), np.tile(y.ravel(), 2), 0.001 * side])
+    normals = side[:, None] * [0.0, 0, 1]
+    flatness, faces = surface_faces(points, normals)
+    assert flatness == pytest.approx(1)
+    assert np.array_equal(faces[:, 0], normals) and not faces[:, 1:].any()
+
+
+def test_a_ball_is_nearly_flat_and_less_so_than_a_plane():
+    i = np.arange(2000) + 0.5
+    z, turn = 1 - 2 * i / 2000, np.pi * (1 + 5**0.5) * i
+    points = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    flatness, faces = surface_faces(points, points)
+    assert flatness.min() > 0.99 and flatness.max() < 0.9995
+    assert np.array_equal(faces[:, 0], points)
+
+
+def test_nodes_near_the_surface_know_the_nearest_point():
+    points = np.array([[0.31, 0.5, 0.5], [0.69, 0.5, 0.5]])
+    x = np.indices((11, 11, 11)).transpose(1, 2, 3, 0) * 0.1
+    depth = 0.2 - np.linalg.norm(x - 0.5, axis=-1)
+    found = nearest_points(points, depth, np.zeros(3), 0.1)
+    near = np.abs(depth) < 0.4
+    assert (found[~near] == -1).all() and near.sum() < near.size
+    distance = np.linalg.norm(x[..., None, :] - points, axis=-1)
+    assert np.take_along_axis(distance, found[..., None].clip(0), -1)[..., 0][near] == pytest.approx(
+        distance.min(-1)[near]
+    )
+    assert (nearest_points(np.zeros((0, 3)), depth, np.zeros(3), 0.1) == -1).all()

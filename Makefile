@@ -9,11 +9,12 @@ PYTEST := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE PYTHONDONTWRITEBYTECODE= $(B
 
 .PHONY: setup demo test test-slow test-all test-gpu lint clean
 
+# of other packages only what is imported is compiled, when it is: all of them would take half a minute
 setup: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install -q --no-compile -c constraints.txt -e ".[dev]"
 	$(BIN)/python -m compileall -q -j 0 ngff_cli stages
 	touch $@
 

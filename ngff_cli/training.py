@@ -42,7 +42,8 @@ def train(
     ] = 0.0,
     gradient_discount: Annotated[float, Option(help="factor on the gradient per frame of backpropagation")] = 0.9,
     groups: Annotated[
-        str, Option(help="groups to train on, also varied, solid, turned; the last 100 scenes are for validation")
+        str,
+        Option(help="groups to train on, also varied, solid, turned, meshes; the last 100 scenes are for validation"),
     ] = "3_0..3_8",
     compiled: Annotated[bool, Option("--compiled", help="compile the training step first; for GPUs")] = False,
     seed: Seed = 0,

@@ -196,15 +196,15 @@ def a_user_against_the_walls(n, state):
     return {
         0: [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": [-3.0, 0.1, 0.4]}],
         2: [{"do": "push", "object": 2, "point": [0.3, 0.0, 0.3], "direction": [0.0, 1.0, 0.0], "strength": 3.0}],
-        25: [{"do": "lift", "object": 2, "height": 5.0}],
+        12: [{"do": "lift", "object": 2, "height": 5.0}],
     }.get(n, [])
 
 
 @pytest.mark.usefixtures("device")
 def test_walls_stop_what_is_pulled_and_pushed_in_the_page_as_in_the_engine(world, tmp_path, monkeypatch, open_page):
     box = "-0.7,-0.5,0,0.7,0.5,1"
-    live, keypoints, *_ = live_session(world, "ngff", monkeypatch, a_user_against_the_walls, 51, box)
-    end = page_session(tmp_path, open_page, a_user_against_the_walls, 51, box)
+    live, keypoints, *_ = live_session(world, "ngff", monkeypatch, a_user_against_the_walls, 30, box)
+    end = page_session(tmp_path, open_page, a_user_against_the_walls, 30, box)
     assert (end - live[-1]).norm(dim=1).max() < 1e-3
     radius, walls = 0.15, parse_box(box)
     assert live[:, keypoints.object_id == 1].mean(1)[:, 0].min() < -0.7 + 2 * radius  # it was pulled to the wall

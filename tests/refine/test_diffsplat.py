@@ -143,6 +143,7 @@ def test_upscaling_needs_the_generator():
         RefineOptions(completer="diffsplat", upscale="x2")
 
 
+@pytest.mark.slow
 def test_output_of_random_weights_is_rejected(seen, tmp_path, caplog, monkeypatch):
     """Random weights in the published layouts, through both loaders, OSEDiff, a sampler with fewer steps, and fits."""
     pytest.importorskip("diffusers")

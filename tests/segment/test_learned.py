@@ -25,6 +25,7 @@ def test_objects_apart_on_a_table_are_found():
     assert min(overlaps.values()) > 0.85, overlaps
 
 
+@pytest.mark.slow
 def test_an_object_that_fills_the_photos_is_one():
     """It is .8 high, with cameras at a distance of one unit."""
     r = 0.4

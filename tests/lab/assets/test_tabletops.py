@@ -109,6 +109,7 @@ def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path,
     assert means["apart"]["geometric"] > 0.9
 
 
+@pytest.mark.slow
 def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
@@ -141,6 +142,7 @@ def test_failed_reconstruction_finds_nothing(monkeypatch):
         assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
 
 
+@pytest.mark.slow
 def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
     pytest.importorskip("transformers")
     from stages.core.models.sam2 import mask_generation, segmenter

@@ -40,6 +40,7 @@ def scenes(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_ablations_are_trained_and_judged(scenes, monkeypatch, device):
     monkeypatch.setattr(bench, "TRAINING", {"score_scenes": 1, "score_steps": 2, "widths": (4, 8), "blocks": 1})
     out = scenes / "rows.json"

@@ -165,6 +165,7 @@ def test_damaged_files_are_found_and_repaired(data, options):
     assert digests(data) == before  # although only one scene was simulated again
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_to_the_same_bytes(data, tmp_path, options):
     part = f"replace(OPTIONS, only='scenes,mpm', device={options.device!r})"
     code = ("import os; from dataclasses import replace; from pathlib import Path\n"

@@ -131,6 +131,7 @@ def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
     assert words.endswith(f'--materials {slide / "m.json"} --velocity "object=1 2,0.5,0"')
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
 def test_cma_es_comes_nearer_from_far_away(slide, device, monkeypatch):
     monkeypatch.setattr(search, "GENERATIONS", 5)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
-from stages.core.geometry.surface_faces import NEAR, nearest_points, surface_faces
+from stages.core.geometry.surface_faces import FACE_COSINE, NEAR, nearest_points, surface_faces
 from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
@@ -73,10 +73,11 @@ class _Shape:
         height = first[2] + self.surface.h * np.arange(depth.shape[2]) - self.floor
         return np.minimum(depth, height), first
 
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (p, 3) of the surface, and outward normals (p, 3)."""
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points (p, 3) of the surface, outward normals (p, 3), and which (p,) are at edges and corners of a hull."""
         if self.hull is None:
             points, normals = self.surface.samples()
+            at_edge = np.zeros(len(points), bool)
         else:
             points = self.surface.points[self.surface.thinned()]
             beyond, faces = self._beyond_faces(points), self._faces[:, :3]
@@ -85,12 +86,15 @@ class _Shape:
             on_faces = points - highest * faces[face]
             corners = self.hull.points[self.hull.vertices]
             nearest = self._beyond_faces(corners) > -self.surface.h
-            mean = nearest.astype(float) @ faces
-            normals = np.concatenate([mean / np.linalg.norm(mean, axis=1, keepdims=True).clip(1e-9), faces[face]])
+            mean = nearest.astype(float) @ faces / nearest.sum(1, keepdims=True)
+            length = np.linalg.norm(mean, axis=1, keepdims=True)
+            normals = np.concatenate([mean / length.clip(1e-9), faces[face]])
             points = np.concatenate([corners, on_faces])
+            at_edge = np.append(length[:, 0] < FACE_COSINE, np.zeros(len(on_faces), bool))
         if (above := points[:, 2] > self.floor - self.surface.h).any():
-            points, normals = np.maximum(points[above], [-np.inf, -np.inf, self.floor]), normals[above]
-        return points, normals
+            points = np.maximum(points[above], [-np.inf, -np.inf, self.floor])
+            normals, at_edge = normals[above], at_edge[above]
+        return points, normals, at_edge
 
     @cached_property
     def _faces(self) -> np.ndarray:
@@ -109,8 +113,8 @@ def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], l
     """The grid of a body with keypoints at `arm` [m]; `start` is the origin of the scene in the body's frame [m]."""
     depth, first = shape.depth_grid()
     low, h = start + length * torch.from_numpy(first).float(), length * shape.surface.h
-    points, normals = shape.points()
-    flatness, faces = surface_faces(points, normals)
+    points, normals, at_edge = shape.points()
+    flatness, faces = surface_faces(points, normals, at_edge)
     outer = extreme_rows(points)
     others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
     row = np.union1d(outer, others)  # the outermost, and others far from each other

@@ -165,10 +165,11 @@ def test_gain_of_energy_counts_from_the_last_force(scene, end, gain):
 
 def test_depth_below_the_surface_of_a_cube(scene):
     """Linear towards the nearest face, negative outside."""
-    depth = monitor_of(scene)._surface(0).depth
+    surface = monitor_of(scene)._surface(0)
+    depth = surface.depth
     x = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, -0.08, 0.1], [0.1, 0.0, 0.1], [0.15, 0.0, 0.1]])
     np.testing.assert_allclose(depth(x)[:4], [0.1, 0.05, 0.02, 0.0], atol=0.008)
-    assert depth(x)[4] < -0.01
+    assert depth(x)[4] < -surface.h
 
 
 def test_a_body_that_has_turned_is_measured_where_it_is(scene):

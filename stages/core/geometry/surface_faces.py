@@ -16,22 +16,26 @@ AROUND = 24  # nearest points among which the faces at an edge or a corner are
 SAME_FACE = 0.9  # least cosine between normals of one face
 NEAR = 4  # edges of a grid from the surface up to which the nearest point is looked for
 FACES = 3  # that meet in a corner, at most
+BETWEEN = 0.5  # least cosine of a normal between those of faces to one of them, .58 at a cube's corners
 OPPOSED = 0.9  # least cosine of the angle at which the faces of two surfaces are parallel, at the edges of both
 CURVED = 5e-4  # difference of flatness that counts: a plane has 1, a ball of 2000 points .998
 
 
-def surface_faces(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surface_faces(
+    points: np.ndarray, normals: np.ndarray, at_edge: np.ndarray | bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """How flat (n,) the surface is at points (n, 3) with outward normals (n, 3), and the normals (n, 3, 3) of the faces
     at each: that of its face, or of up to three around it; the others are 0.
 
-    Flatness is 1 in a plane, and 0 where a point is not on a face.
+    Those `at_edge` (n,) are known not to be on a face, even where all points around them are in one place. Flatness
+    is 1 in a plane, and 0 where a point is not on a face.
     """
     near = cKDTree(points).query(points, min(AROUND, len(points)))[1].reshape(len(points), -1)
     around = normals[near[:, :NEIGHBOURS]]
     same_side = (around * normals[:, None]).sum(-1) > OTHER_SIDE
     mean = (around * same_side[..., None]).sum(1) / same_side.sum(1, keepdims=True).clip(1)
     flatness = np.linalg.norm(mean, axis=1)
-    on_face = flatness > FACE_COSINE
+    on_face = (flatness > FACE_COSINE) & ~np.asarray(at_edge)
     faces, count = np.zeros((len(points), FACES, 3)), np.zeros(len(points), np.int64)
     faces[on_face, 0], count[on_face] = normals[on_face], FACES
     for row in near.T:
@@ -39,6 +43,8 @@ def surface_faces(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, 
         new = np.flatnonzero(on_face[row] & ~known & (count < FACES))
         faces[new, count[new]] = normals[row[new]]
         count[new] += 1
+    small = (faces * normals[:, None]).sum(-1).max(1) < BETWEEN  # on a face that is too small to have inner points
+    faces[small, 1:], faces[small, 0] = faces[small, :-1], normals[small]
     return np.where(on_face, flatness, 0.0), faces
 
 

@@ -77,3 +77,8 @@ def squared_distances(mask: Mask, most: int) -> UInt[np.ndarray, "x y z"]:
             np.minimum(out[k:], given[:-k] + squared.dtype.type(k * k), out=out[k:])
             np.minimum(out[:-k], given[k:] + squared.dtype.type(k * k), out=out[:-k])
     return np.minimum(squared, beyond)
+
+
+def within(mask: Mask, radius: int) -> Mask:
+    """The voxels whose centre is within this distance [voxels] of that of one of the mask."""
+    return squared_distances(mask, radius) <= radius**2

@@ -27,7 +27,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
-from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded
+from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -160,6 +160,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     points, gap = _cloud(scene, object_id, seed)
     spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
+    gap = max(gap, 1.5 * spacing)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     ways = (True, False) if _stands(points, h, scene.floor) else (False,)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
@@ -249,16 +250,16 @@ def _gap(points: np.ndarray) -> float:
 
 def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     """The shell with gaps closed and the enclosed volume filled; the floor closes the bottom of standing objects."""
-    wide = dilated(shell, gap)
+    wide = within(shell, gap)
     layers = np.flatnonzero(shell.any((0, 1)))
     sealed = wide.copy()
     if standing:
         sealed[:, :, : layers[0] + 1] = True
     outside = _outside(~sealed)
     enclosed = ~(outside | sealed)
-    grown = dilated(enclosed, gap) & wide if enclosed.any() else enclosed
-    closed = eroded(wide, gap)
-    body = shell | closed | enclosed | (grown & ~dilated(outside, gap))
+    grown = within(enclosed, gap) & wide if enclosed.any() else enclosed
+    closed = ~within(~wide, gap)
+    body = shell | closed | enclosed | (grown & ~within(outside, gap))
     if not standing:
         return body | _cavities(body, LEAK_RADII)
     # gaps that closing just misses leak too, but a cloth on the floor has folds that look like cavities with wide leaks

@@ -46,6 +46,21 @@ def test_points_of_a_sheet_are_on_the_face_of_their_side():
     assert np.array_equal(faces[:, 0], normals) and not faces[:, 1:].any()
 
 
+def test_the_end_of_a_thin_rod_is_a_face():
+    """Of three points along a side, of which only the middle one is on a face by those around it."""
+    x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
+    end = np.column_stack([x.ravel(), y.ravel(), np.zeros(9)])
+    k, z = np.meshgrid([-1.0, 0.0, 1.0], np.arange(0.5, 12))
+    sides = [np.stack(np.broadcast_arrays(*axes), -1).reshape(-1, 3) for axes in
+             ((1.5, k, z), (-1.5, k, z), (k, 1.5, z), (k, -1.5, z))]  # fmt: skip
+    outward = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    points = np.concatenate([end, *sides])
+    normals = np.concatenate([np.tile([0.0, 0, -1], (9, 1)), np.repeat(outward, k.size, 0)])
+    flatness, faces = surface_faces(points, normals)
+    assert not np.delete(flatness[:9], 4).any()
+    assert (faces[:9] == [0, 0, -1]).all(2).any(1).all()
+
+
 def test_a_ball_is_nearly_flat_and_less_so_than_a_plane():
     i = np.arange(2000) + 0.5
     z, turn = 1 - 2 * i / 2000, np.pi * (1 + 5**0.5) * i

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.adam import Moments, adam_step
+from stages.core.kernels.cuda_graphs import captured
 from stages.core.kernels.splat.photometric_loss import LossTerms, photometric_loss
 from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
@@ -259,10 +260,7 @@ class _CapturedSteps(_Steps):
         return Capacity.at_least(max(pairs), self.device)
 
     def _capture(self, group: _Targets) -> None:
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._step(group)
-        self.graphs[group.size] = graph
+        self.graphs[group.size] = captured(lambda: self._step(group))
 
     def _step(self, group: _Targets) -> None:
         row, grey, rate = (x.index_select(0, self.counter) for x in (self.rows, self.greys, self.rates))

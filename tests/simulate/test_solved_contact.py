@@ -14,7 +14,9 @@ from tests.conftest import two_balls_scene
 SOLVED = PhysicsBenchOptions(contact="solved")
 
 
-@pytest.mark.parametrize("name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3"])
+@pytest.mark.parametrize(
+    "name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3", "slide/stool on shelf friction=0.6"]
+)
 def test_agrees_with_theory_where_learned_contact_does_not(device, name):
     experiment = experiments()[name]
     assert experiment.passes("ngff", measure(experiment, "ngff", SOLVED)["value"])

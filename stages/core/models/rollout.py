@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.kernels.cuda_graphs import captured
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions
@@ -135,10 +136,7 @@ def _captured(work: Callable[[], None]) -> Callable[[], None]:
         for _ in range(2):
             work()
     torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        work()
-    return graph.replay
+    return captured(work).replay
 
 
 @torch.no_grad()

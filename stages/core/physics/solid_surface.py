@@ -31,6 +31,9 @@ NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on
 MIN_ON_FACE = 6  # samples on the same face by their first normals below which all on the same side are fitted at first
 FITS = 4  # of a plane, with weights that fall with the distance from it
 FLATNESS = 0.1  # distance at which weights fall even if the others are closer [spacing of the samples]
+AT_EDGE = 0.2  # RMS distance of neighbours from the plane of a sample that is at an edge [spacing of the samples]
+FLATTER = 0.5  # ratio of that of a sample beside it, on a face, at most
+ON_PLANE = 0.2  # distance from the plane of that face [spacing of the samples]
 OCTANTS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
@@ -88,6 +91,9 @@ class SolidSurface:
             spread = np.sqrt((weight * height**2).sum(1) / weight.sum(1)).clip(FLATNESS * self.spacing)
             weight = near * np.exp(-((height / spread[:, None]) ** 2))
         normals *= np.where((normals * outward).sum(1, keepdims=True) < 0, -1, 1)
+        bent = np.sqrt((near * height**2).sum(1) / near.sum(1)) / self.spacing
+        face = _face_beside(points, middle, normals, outward, bent, self.spacing)
+        middle, normals = middle[face], normals[face]
         out.points = points + ((middle - points) * normals).sum(1, keepdims=True) * normals
         out.normals = normals
         out._tree = cKDTree(out.points)
@@ -176,6 +182,19 @@ class SolidSurface:
     def _centres(self, mask: np.ndarray) -> np.ndarray:
         """Centres (k, 3) of the voxels of a mask of the grid."""
         return self._first + self.h * np.argwhere(mask)
+
+
+def _face_beside(
+    points: np.ndarray, middle: np.ndarray, normals: np.ndarray, outward: np.ndarray, bent: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Rows (n,) of the samples whose planes, at `middle` (n, 3), those at points (n, 3) are on: its own, and for one at
+    an edge that of a sample beside it, on a face, on which it is.
+    """
+    row = np.minimum(cKDTree(points).query(points, NEIGHBOURS)[1], len(points) - 1)
+    off = np.abs(((points[:, None] - middle[row]) * normals[row]).sum(-1)) / spacing
+    fits = (bent[row] < FLATTER * bent[:, None]) & ((normals[row] * outward[:, None]).sum(-1) > 0) & (off < ON_PLANE)
+    best = np.where(fits, off, np.inf).argmin(1)
+    return np.where((bent > AT_EDGE) & fits.any(1), row[np.arange(len(row)), best], np.arange(len(row)))
 
 
 def _planes(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

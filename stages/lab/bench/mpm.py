@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from stages.core.errors import InputError
+from stages.core.kernels.cuda_graphs import captured
 from stages.core.models.initial_conditions import GRAVITY
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import common as bench
@@ -95,10 +96,7 @@ def measure_three_kernel(particles: int, device: str) -> float:
     many = lambda: [mpm_three_kernel.substep(solver, nodes, SUBSTEP) for _ in range(steps)]  # noqa: E731
     many()
     if device != "cpu":
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            many()
-        return bench.median_seconds(graph.replay, device) / steps
+        return bench.median_seconds(captured(many).replay, device) / steps
     return bench.median_seconds(many, device, repeat=1) / steps
 
 

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from stages.core.kernels.cuda_graphs import captured
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.trees import leaf_tensors, replace_tensors
@@ -173,10 +174,9 @@ class RolloutLoss:
                 for _ in range(2):
                     self._rollout(static)
             torch.cuda.current_stream().wait_stream(side)
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                self.result = self._rollout(static)
-            self.graph, self.static_inputs = graph, static
+            results: list[Tensor] = []
+            self.graph = captured(lambda: results.append(self._rollout(static)))
+            (self.result,), self.static_inputs = results, static
         except RuntimeError as error:
             torch.cuda.synchronize()
             log.info("no CUDA graph, continuing step by step: %s", str(error).splitlines()[0])

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 import torch
 import warp as wp
 
+from stages.core.kernels.cuda_graphs import captured
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.active import ActiveBlocks, clear_active_blocks
 from stages.core.kernels.mpm.grid import BLOCK
@@ -66,10 +67,7 @@ class GraphedFrames(ABC):
                 self._graphs[key] = None
                 return
             if self._graphs[key] is None:
-                graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(graph, pool=self._pool):
-                    self._run(dt, steps)
-                self._graphs[key] = graph
+                self._graphs[key] = captured(lambda: self._run(dt, steps), pool=self._pool)
             self._graphs[key].replay()
 
     @property

@@ -40,6 +40,7 @@ MIN_PARTICLES = 40  # per object
 MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
 START = 0.25  # of the object's bounds in their voxel
+CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 
@@ -160,7 +161,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     points, gap = _cloud(scene, object_id, seed)
     spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
-    gap = max(gap, 1.5 * spacing)
+    gap = max(gap, CLOSED * spacing)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     ways = (True, False) if _stands(points, h, scene.floor) else (False,)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded
+from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 
 CUBE = np.ones((3, 3, 3), bool)
 
@@ -30,3 +30,9 @@ def test_squared_distances_are_exact_up_to_a_limit(mask, most):
 
 def test_distances_in_an_empty_grid_are_beyond_the_limit():
     assert (squared_distances(np.zeros((3, 3, 3), bool), 4) == 17).all()
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+def test_within_is_dilation_by_a_ball(mask, radius):
+    x = np.indices((2 * radius + 1,) * 3) - radius
+    assert (within(mask, radius) == ndimage.binary_dilation(mask, (x**2).sum(0) <= radius**2)).all()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from stages.core.errors import InputError
 from stages.core.physics import particles
@@ -339,3 +340,15 @@ def test_particles_do_not_depend_on_the_unit_of_length(unit):
     one, other = (sample_bodies(scene(splats(u * sphere(2000), scale=0.003 * u)), 1000) for u in (1.0, unit))
     assert other.spacing / unit == pytest.approx(one.spacing, rel=1e-3)
     assert float(other.volume.sum()) / unit**3 == pytest.approx(float(one.volume.sum()), rel=0.05)
+
+
+def test_a_cube_sampled_at_every_third_voxel_is_filled():
+    """Between samples its faces may lack their outermost voxels, but nothing below them."""
+    side = np.zeros(30, bool)
+    side[6:25] = True
+    every = np.zeros(30, bool)
+    every[6:25:3] = True
+    cube = side[:, None, None] & side[:, None] & side
+    shell = cube & ~ndimage.binary_erosion(cube) & (every[:, None, None] & every[:, None] & every)
+    body = particles._fill(shell, 3, False)
+    assert body[ndimage.binary_erosion(cube)].all() and not body[~cube].any()

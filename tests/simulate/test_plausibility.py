@@ -170,6 +170,8 @@ def test_depth_below_the_surface_of_a_cube(scene):
     x = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, -0.08, 0.1], [0.1, 0.0, 0.1], [0.15, 0.0, 0.1]])
     np.testing.assert_allclose(depth(x)[:4], [0.1, 0.05, 0.02, 0.0], atol=0.008)
     assert depth(x)[4] < -surface.h
+    beside = np.array([[0.1 + surface.h, 0.0, 0.1], [0.0, -0.1 - surface.h, 0.1]])
+    np.testing.assert_allclose(depth(beside), -surface.h, atol=0.5 * surface.h)
 
 
 def test_a_body_that_has_turned_is_measured_where_it_is(scene):

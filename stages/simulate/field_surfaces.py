@@ -16,13 +16,13 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
+from stages.core.geometry.extremes import extreme_rows
 from stages.core.geometry.surface_faces import FACE_COSINE, NEAR, nearest_points, surface_faces
 from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
-from stages.core.physics.convex_cuts import extreme_rows
-from stages.core.physics.convex_parts import balls, convex_hulls
 from stages.core.physics.keypoints import farthest_points
+from stages.core.physics.rigid_shapes import balls, convex_hulls
 from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.core.scene.scene import Scene
 from stages.simulate.model_units import ModelUnits

@@ -38,15 +38,17 @@ class Stance:
 class RestingBodies:
     """Which bodies are held. Bodies are numbered as in the model: 0 is the world."""
 
-    def __init__(self, model, data, stances: list[Stance], at_rest: Iterable[int]):
-        """`stances` of bodies 1.. ; `data` has the contacts at rest, with gaps of up to SUPPORT_GAP."""
+    def __init__(self, model, stances: list[Stance], pairs: np.ndarray, normals: np.ndarray, at_rest: Iterable[int]):
+        """`stances` of bodies 1.. ; pairs (k, 2) of bodies touch at rest, with gaps of up to SUPPORT_GAP, and normals
+        (k, 3) from the first to the second.
+        """
         self._model = model
         self._bodies = model.dof_bodyid[::FALLING].copy()  # of each joint
         self._stances = [stances[i - 1] for i in self._bodies]
         self._friction, self._height, self._half_width = (
             np.array([getattr(s, name) for s in self._stances]) for name in ("friction", "height", "half_width")
         )
-        self.resting_on = _supports(model, data, stances)
+        self.resting_on = _supports(stances, pairs, normals[:, 2])
         self.held = np.isin(self._bodies, list(at_rest))
         self.fixed = np.ones(model.nbody, bool)  # bodies that do not move
         self.fixed[self._bodies] = self.held
@@ -118,13 +120,12 @@ def excess_force(
     return np.maximum(excess, -load)
 
 
-def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
+def _supports(stances: list[Stance], pairs: np.ndarray, upwards: np.ndarray) -> dict[int, set[int]]:
     """Body -> the bodies that rest on it: in contact from above and not on the floor, or without contact over it."""
     found: dict[int, set[int]] = {}
-    of = model.geom_bodyid[data.contact.geom]
-    of[of > len(stances)] = 0  # fixed, as the world
-    for pair, up in zip(of, data.contact.frame[:, 2], strict=True):
-        lower, upper = pair if up > 0 else pair[::-1]  # the normal points from the first to the second
+    of = np.where(pairs > len(stances), 0, pairs)  # others are fixed, as the world
+    for pair, up in zip(of, upwards, strict=True):
+        lower, upper = pair if up > 0 else pair[::-1]
         if lower > 0 and upper > 0 and abs(up) > SUPPORT_COSINE and not stances[upper - 1].on_floor:
             found.setdefault(int(lower), set()).add(int(upper))
     supported = set().union(*found.values())

@@ -1,4 +1,4 @@
-"""The rigid-body engine: convex parts of each object, moved by MuJoCo with Coulomb friction and restitution.
+"""The rigid-body engine: a body for each object, moved by MuJoCo with Coulomb friction and restitution.
 
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
@@ -16,7 +16,7 @@ Sources: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based
 spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited"; exact friction from
 the relaxed one: De Saxce and Feng 1998, "The bipotential method"; Le Lidec et al. 2024, "Contact models in robotics".
 
-Bodies of several parts also touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
+Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
 (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
 is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.
 """
@@ -36,9 +36,9 @@ from torch import Tensor
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.table_outline import TableOutline
-from stages.core.physics.convex_parts import convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, MaterialChoice
+from stages.core.physics.rigid_shapes import rigid_shapes
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
@@ -70,8 +70,8 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     bodies = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
-    log.info("%d bodies of %d convex parts, substep %.3g s (%d per frame)", len(bodies),
-             sum(len(b.parts.hulls) for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
+    log.info("%d bodies, %d of them not convex, substep %.3g s (%d per frame)", len(bodies),
+             sum(not b.shape.convex for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
     return _states(scene, keypoints, setup, bodies, world, prompts, options)
 
 
@@ -81,7 +81,7 @@ def _states(
 ) -> Iterator[FrameState]:  # fmt: skip
     """Keypoints moved with their bodies."""
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
-    com = torch.stack([b.parts.com for b in bodies])
+    com = torch.stack([b.shape.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
     current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
@@ -109,24 +109,24 @@ def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: Sim
     """The bodies where the scene has them; what lies below the floor is cut off, if most is above it."""
     unit, bodies = scene.metres_per_unit, []
     floor = setup.box.low[2]
-    divided = convex_parts(scene, options.seed, floor)
-    for row, (o, parts) in enumerate(zip(scene.objects, divided, strict=True)):
+    shapes = rigid_shapes(scene, options.seed, floor)
+    for row, (o, shape) in enumerate(zip(scene.objects, shapes, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
         ground, own = floor, scene.gaussians.object_id == o.id
         if float(scene.gaussians.means[own, 2].median()) < floor:
-            (parts,) = convex_parts(replace(scene, gaussians=scene.gaussians[own], objects=(o,)), options.seed)
-            ground = float(torch.cat(parts.hulls)[:, 2].min())
+            (shape,) = rigid_shapes(replace(scene, gaussians=scene.gaussians[own], objects=(o,)), options.seed)
+            ground = float(shape.hull[:, 2].min())
             log.info("object %d (%s) is below the floor; it stands at %.3g", o.id, o.name, ground)
-        parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
+        shape = replace(shape, com=shape.com + shift, inertia=shape.inertia + shape.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
-        mass = m.density * parts.volume * unit**3
+        mass = m.density * shape.volume * unit**3
         friction = m.friction if options.friction is None else options.friction
-        start = unit * (parts.com + setup.lift[row])
-        bodies.append(Body(parts, m, friction, mass, start, pinned, unit * ground))
+        start = unit * (shape.com + setup.lift[row])
+        bodies.append(Body(shape, m, friction, mass, start, pinned, unit * ground))
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
         log.info("object %d (%s): %s, %s%s%s", o.id, o.name, choice.name, scene.mass_text(mass), ", pinned" * pinned,
                  guess)  # fmt: skip
-        z = torch.cat(parts.hulls)[:, 2]
+        z = shape.hull[:, 2]
         height = unit * float(z.max() - z.min())
         if MODELS[m.model].plastic:
             log.warning("object %d (%s): %s yields or flows, but rigid bodies keep their shape; use --engine mpm",
@@ -152,7 +152,7 @@ class _World:
         self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
         unit = scene.metres_per_unit
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
-        size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (torch.cat(b.parts.hulls) for b in bodies))
+        size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (b.shape.hull for b in bodies))
         floor = unit * setup.box.low[2]
         table = table_of(scene, options)
         fall = max(float(b.start[2]) for b in bodies) - (floor if table is None else unit * table.ground)
@@ -182,7 +182,7 @@ class _World:
         lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
         mujoco.mj_fwdPosition(self.model, self.data)
         self._overlaps = InitialOverlaps(self.model, self.data)
-        self._surfaces = self._surface_contacts(setup, options) if any(len(b.parts.hulls) > 1 for b in bodies) else None
+        self._surfaces = self._surface_contacts(setup, options) if not all(b.shape.convex for b in bodies) else None
         self._edges = None if table is None else self._table_edges(table)
         self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         self._resting = self._resting_bodies(setup, at_rest)
@@ -196,7 +196,7 @@ class _World:
 
     def _arm(self, at, row: int) -> np.ndarray:
         """From the centre of mass to the point of application, in the body's frame."""
-        com = self._bodies[row].parts.com
+        com = self._bodies[row].shape.com
         return ((torch.tensor(at) - com) * self._scene.metres_per_unit / self.units.length).double().numpy()
 
     def change(self, materials: dict[int, MaterialChoice], pinned: Collection[int], options: SimulateOptions) -> None:
@@ -235,19 +235,19 @@ class _World:
 
         def shape(row: int) -> SurfaceShape:
             b = self._bodies[row]
-            if b.parts.ball is not None:
-                return ball_shape(scale * (b.parts.ball.centre - b.parts.com.double().numpy()),
-                                  scale * b.parts.ball.radius)  # fmt: skip
+            if b.shape.ball is not None:
+                return ball_shape(scale * (b.shape.ball.centre - b.shape.com.double().numpy()),
+                                  scale * b.shape.ball.radius)  # fmt: skip
             surface = solid_surface(self._scene, self._ids[row], options.seed)
             ground = b.ground / self._scene.metres_per_unit
-            return surface_shape(surface, ground, b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
+            return surface_shape(surface, ground, b.shape.com.double().numpy(), scale, b.shape.convex)
 
         return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self._bodies))))
 
     def _table_edges(self, table: TableOutline) -> TableEdges:
         scale = self._scene.metres_per_unit / self.units.length
         outline = TableOutline(table.normals, scale * table.offsets, scale * table.ground)
-        corners = [scale * (torch.cat(b.parts.hulls) - b.parts.com).double().numpy() for b in self._bodies]
+        corners = [scale * (b.shape.hull - b.shape.com).double().numpy() for b in self._bodies]
         return TableEdges(self._mujoco, self.model, self.data, outline, corners)
 
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
@@ -256,17 +256,26 @@ class _World:
         lift = setup.lift.double().numpy() * unit
         self.model.geom_margin[:] = SUPPORT_GAP
         self._mujoco.mj_fwdPosition(self.model, self.data)
-        stances = []
+        stances, touching = [], self._touching()
         for i, b in enumerate(self._bodies):
-            points = torch.cat(b.parts.hulls).double() * unit
-            height = float(b.parts.com[2] * unit - points[:, 2].min())
-            start = b.start.double().numpy() / self.units.length - lift[i] - b.parts.com.double().numpy() * unit
+            points = b.shape.hull.double() * unit
+            height = float(b.shape.com[2] * unit - points[:, 2].min())
+            start = b.start.double().numpy() / self.units.length - lift[i] - b.shape.com.double().numpy() * unit
             low, high = (start + corner.numpy() for corner in (points.amin(0), points.amax(0)))
             on_floor = bool(setup.on_floor_as_seen[i]) or float(low[2]) - setup.box.low[2] * unit < ON_FLOOR
             stances.append(Stance(b.friction, height, float((high - low)[:2].min()) / 2, on_floor, low, high))
-        resting = RestingBodies(self.model, self.data, stances, [i + 1 for i in at_rest])
+        resting = RestingBodies(self.model, stances, *touching, [i + 1 for i in at_rest])
         self.model.geom_margin[:] = 0
         return resting
+
+    def _touching(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (k, 2) of bodies with gaps of up to SUPPORT_GAP, and normals (k, 3) from the first to the second."""
+        contact = self.data.contact
+        pairs, normal = self.model.geom_bodyid[contact.geom], contact.frame[:, :3]
+        if self._surfaces is None:
+            return pairs, normal
+        kept, near = ~self._surfaces.replaced(contact.geom), self._surfaces.touching(self.data)
+        return np.concatenate([pairs[kept], near[0]]), np.concatenate([normal[kept], near[1]])
 
     def release(self, rows: Iterable[int]) -> None:
         """Let objects move that rested until now."""
@@ -293,16 +302,16 @@ class _World:
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
                       mujoco.mj_collision):  # fmt: skip
             stage(model, data)
-        count = data.ncon
+        found = count = data.ncon
         if self._surfaces is not None:
             self._surfaces.exclude(data)
-            self._surfaces.add(data, self._resting.fixed)
+            count = self._surfaces.add(data, self._resting.fixed)
         if self._edges is not None:
             self._edges.apply(data, self._resting.fixed)
         for stage in (mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint):
             stage(model, data)
-        if count:
-            self._overlaps.subtract(data, self._resting.fixed, count)
+        if found:
+            self._overlaps.subtract(data, self._resting.fixed, found)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.physics.convex_parts import ConvexParts
 from stages.core.physics.materials import Material
+from stages.core.physics.rigid_shapes import RigidShape
 
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
 CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
-PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
+ROUGH_DAMPING = 0.4  # least damping ratio of bodies that are not convex, whose contacts come and go in a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
 
@@ -38,7 +38,7 @@ class Units:
 class Body:
     """An object as a rigid body, in metres and kilograms."""
 
-    parts: ConvexParts  # in scene units, where reconstructed
+    shape: RigidShape  # in scene units, where reconstructed
     material: Material
     friction: float
     mass: float
@@ -48,7 +48,7 @@ class Body:
 
     def damping(self, material: Material) -> float:
         """Ratio to critical of a contact's damping."""
-        return max(damping_ratio(material.loss), PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
+        return max(damping_ratio(material.loss), 0.0 if self.shape.convex else ROUGH_DAMPING)
 
     def rolling_arm(self, radius: float, gravity: float) -> float:
         """Moment that resists rolling on a rigid plane, of a ball of this radius [m] under its weight, per weight [m].
@@ -81,7 +81,7 @@ def damping_ratio(loss: float) -> float:
 
 def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: Sequence[float], box: Sequence | None,
                  around: Sequence):  # fmt: skip
-    """MuJoCo's model: a body for each object, with a mesh for each convex part or a ball for a round one; planes for
+    """MuJoCo's model: a body for each object, with its convex hull as a mesh or a ball for a round one; planes for
     the `levels`, of which the first is the floor, and each wall of `box` (its low and high corner), and the fixed boxes
     `around`, as pairs of corners; then a body for the ground under each object that is below the floor. `gravity`, the
     heights of the levels and the corners are in `units`.
@@ -93,7 +93,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     spec.option.gravity = [0, 0, -gravity]
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
-    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
+    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two hulls; always so from version 4
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
     impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
     planes = [((0.0, 0.0, level), (0.0, 0.0, 1.0)) for level in levels]
@@ -125,25 +125,23 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
 
 
 def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, impedance: list) -> None:
-    unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
+    unit = float(b.mass / (b.material.density * b.shape.volume)) ** (1 / 3)  # metres in a scene unit
     body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
     body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
-    inertia = b.parts.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
+    inertia = b.shape.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
     body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     if not b.pinned:
         body.add_freejoint()
     # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
     contact = {"solref": [-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], "solimp": impedance}
-    ball = b.parts.ball
+    ball = b.shape.ball
     if ball is not None:  # a polyhedron loses energy where it rolls over its edges
         arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)
-        at = (ball.centre - b.parts.com.double().numpy()) * unit / units.length
+        at = (ball.centre - b.shape.com.double().numpy()) * unit / units.length
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[ball.radius * unit / units.length, 0, 0], pos=at,
                       condim=6, friction=[b.friction, 0, arm / units.length], **contact)  # fmt: skip
         return
-    for n, hull in enumerate(b.parts.hulls):
-        vertices = (hull - b.parts.com).double() * unit / units.length
-        mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                      **contact)  # fmt: skip
+    vertices = (b.shape.hull - b.shape.com).double() * unit / units.length
+    mesh = spec.add_mesh(name=name, uservert=vertices.flatten().tolist())
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0], **contact)

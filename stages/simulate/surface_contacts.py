@@ -1,15 +1,13 @@
-"""Contacts between the surfaces of rigid bodies, of which convex parts are only an approximation.
+"""Contacts of the surfaces of rigid bodies that do not fill their convex hull.
 
-The faces of convex parts lie at the mean level of the surface under them, with small steps between them, over which a
-sliding body would stumble. So where one of two bodies has several parts, samples of each surface are looked up in the
-signed distance of the other one, and those inside are contacts, with the normals of the faces that meet
-(`surface_faces.py`); contacts of the parts are excluded. The samples that span the contact of a pair take part.
-What a rough surface has beyond its parts also touches the floor and walls. Bodies that fill their convex hull need none
-with each other and with planes.
+Where one of two bodies is not convex, samples of each surface are looked up in the signed distance of the other one,
+and those inside are contacts, with the normals of the faces that meet (`surface_faces.py`). The samples that span the
+contact of a pair take part. The outermost samples of a body that is not convex touch the floor and walls. MuJoCo's
+contacts of the hulls of such pairs are excluded; those of convex bodies and those with the background stay.
 
-These contacts are inelastic: critically damped, and pushed apart at no more than the speed at which contacts do not
-rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies at the
-start is no contact, nor the least one since (`initial_overlaps.py`).
+Contacts between surfaces are inelastic: critically damped, and pushed apart at no more than the speed at which contacts
+do not rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies
+at the start is no contact, nor the least one since (`initial_overlaps.py`).
 
 Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
 distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
@@ -26,11 +24,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from stages.core.geometry.extremes import fibonacci
 from stages.core.geometry.surface_faces import CURVED, FACES, OPPOSED, nearest_points, surface_faces
 from stages.core.kernels.depth_lookup import depth_lookup, turned
-from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface
-from stages.simulate.initial_overlaps import WINDOW
+from stages.simulate.initial_overlaps import AllowedOverlaps
 
 FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
@@ -106,7 +104,8 @@ class SurfaceContacts:
         self._ball, self._centre = np.array([s.radius for s in shapes]), np.array([s.centre for s in shapes])
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
-        self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        self._is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self._planes = np.flatnonzero(self._is_plane)
         of = model.geom_bodyid[self._planes]
         pairs = np.arange(1, count + 1)[:, None]
         apart = np.isin((np.minimum(of, pairs) << 16) + np.maximum(of, pairs), model.exclude_signature)
@@ -115,7 +114,7 @@ class SurfaceContacts:
         self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
         self._corners = self._points[np.concatenate(lowest).astype(np.int64)]  # those that can touch planes
         self._apart = np.where(apart, -np.inf, 0.0)  # added to how far a body is beyond a plane
-        # the first part of each, whose friction and damping are those of the body
+        # of each: its friction and damping are those of the body
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
         self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # -1: fixed
         self._rough = np.append(rough, False)
@@ -126,54 +125,80 @@ class SurfaceContacts:
         self._lists: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._pairs, self._pair = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)  # with lists; row of each sample
         self._sample, self._from = NONE  # all lists; way from which on a sample may be inside
-        self._allowed, self._deepest, self._substeps = np.full((count, count), np.inf), np.zeros((count, count)), 0
         fixed = np.zeros(count, bool)
         self._update_lists(data, fixed)
-        self._note(self._contacts(data)[2:], fixed)
-        self._allowed, self._deepest[:] = np.maximum(self._deepest, self._deepest.T), 0.0
-        self._below = np.zeros((count, len(self._planes)))  # how far a body is beyond each plane at the start
+        overlap, below = np.zeros((count, count)), np.zeros((count, len(self._planes)))
+        _, _, depth, a, b = self._contacts(data)
+        np.maximum.at(overlap, (np.minimum(a, b), np.maximum(a, b)), depth)
+        self._overlaps = AllowedOverlaps(overlap)  # of bodies a < b
         row, plane, depth = self._beyond_planes(data, fixed)
-        np.maximum.at(self._below, (self._corner_of[row], plane), depth)
+        np.maximum.at(below, (self._corner_of[row], plane), depth)
+        self._below = AllowedOverlaps(below)
 
-    def add(self, data, fixed: np.ndarray) -> None:
-        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move."""
+    def add(self, data, fixed: np.ndarray) -> int:
+        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move.
+
+        Returns the number of contacts that can rebound; those after them, between surfaces, do not.
+        """
         fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
         speed = np.linalg.norm(velocity[:, :3], axis=1) + np.linalg.norm(velocity[:, 3:], axis=1) * self._radius[free]
         self._path[free] += speed * self._model.opt.timestep
+        self._add_to_planes(data, fixed)
+        count = data.ncon
         self._update_lists(data, fixed)
         x, normal, depth, a, b = self._contacts(data)
-        self._note((depth, a, b), fixed)
-        excess = depth - self._allowed[a, b]
+        pair = np.minimum(a, b), np.maximum(a, b)
+        self._overlaps.note(pair, depth, ~(fixed[:, None] & fixed))
+        excess = depth - self._overlaps.depth[pair]
         k = np.flatnonzero(excess > 0)
         k = k[_extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
-        one, two = self._geom[b[k]], self._geom[a[k]]
-        x, normal, excess = x[k] + depth[k, None] / 2 * normal[k], normal[k], excess[k]
+        at = x[k] + depth[k, None] / 2 * normal[k]
+        add_contacts(self._mujoco, self._model, data, at, normal[k], excess[k], self._geom[b[k]], self._geom[a[k]])
+        return count
+
+    def _add_to_planes(self, data, fixed: np.ndarray) -> None:
+        """Contacts of the outermost samples with planes."""
         row, plane, depth = self._beyond_planes(data, fixed)
-        if len(k) + len(row):
-            of = self._corner_of[row]
-            one, two = np.append(self._planes[plane], one), np.append(self._geom[of], two)
-            normal = np.concatenate([data.geom_xmat[self._planes[plane]][:, 2::3], normal])
-            turn = data.xmat[1 + of].reshape(-1, 3, 3)
-            at = turned(turn, self._corners[row]) + data.xpos[1 + of]
-            x, depth = np.concatenate([at, x]), np.append(depth, excess)
-            add_contacts(self._mujoco, self._model, data, x, normal, depth, one, two)
+        of = self._corner_of[row]
+        self._below.note((of, plane), depth, ~fixed[:, None])
+        excess = depth - self._below.depth[of, plane]
+        k = np.flatnonzero(excess > 0)
+        if not len(k):
+            return
+        of, plane, excess = of[k], plane[k], excess[k]
+        x = turned(data.xmat[1 + of].reshape(-1, 3, 3), self._corners[row[k]]) + data.xpos[1 + of]
+        normal = data.geom_xmat[self._planes[plane]][:, 2::3]
+        k = _extremes(x, normal, excess, of * len(self._planes) + plane)
+        add_contacts(self._mujoco, self._model, data, x[k], normal[k], excess[k], self._planes[plane[k]],
+                     self._geom[of[k]])  # fmt: skip
 
     def exclude(self, data) -> None:
-        """Exclude the contacts of parts of two bodies whose surfaces are looked up."""
-        body = self._body[data.contact.geom]
-        data.contact.exclude[(body >= 0).all(1) & self._rough[body].any(1)] = 1
+        """Exclude the contacts of hulls that surfaces replace."""
+        replaced = self.replaced(data.contact.geom)
+        data.contact.exclude[replaced] = 1
+        data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts
 
-    def _note(self, contacts: tuple, fixed: np.ndarray) -> None:
-        """Take the deepest samples of each pair; those of some substeps bound the overlap allowed from then on."""
-        depth, a, b = contacts
-        np.maximum.at(self._deepest, (a, b), depth)
-        self._substeps += 1
-        if self._substeps % WINDOW == 0:
-            free = ~(fixed[:, None] & fixed)
-            self._allowed[free] = np.minimum(self._allowed, np.maximum(self._deepest, self._deepest.T))[free]
-            self._deepest[:] = 0.0
+    def replaced(self, geom: np.ndarray) -> np.ndarray:
+        """Which (k,) of the contacts of two geometries (k, 2) those of surfaces replace."""
+        body = self._body[geom]
+        return self._rough[body].any(1) & ((body >= 0) | self._is_plane[geom]).all(1)
+
+    def touching(self, data) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (k, 2) of bodies of the model of which samples of one are less than MARGIN outside the other, and the
+        normals (k, 3) from the first to the second.
+        """
+        pairs = np.argwhere(self._possible)
+        lists, _ = self._near(data, pairs, np.zeros(len(pairs)))
+        a, b = np.repeat(pairs, [len(rows) for rows, _ in lists], axis=0).T
+        sample = np.concatenate([NONE[0], *(rows for rows, _ in lists)])
+        turn, at = self._poses(data)
+        k, _, outwards, _, node = self._lookup.near(self._points[sample], a, b, turn, at, MARGIN)
+        a, b, sample = a[k], b[k], sample[k]
+        normal, facing = self._facing(sample, self._nearest[node], outwards, turn[b].transpose(0, 2, 1) @ turn[a])
+        k = np.flatnonzero(facing > 0)
+        return np.stack([b[k], a[k]], 1) + 1, turned(turn[b[k]], normal[k])
 
     def _update_lists(self, data, fixed: np.ndarray) -> None:
         self._way = path = self._path[:, None] + self._path
@@ -266,11 +291,11 @@ class SurfaceContacts:
         return data.xmat[1:end].reshape(-1, 3, 3), data.xpos[1:end]
 
     def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these, more than at the start."""
+        """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these."""
         normal = data.geom_xmat[self._planes][:, 2::3]
         count = len(self._radius)
         at, turn = data.xpos[1 : count + 1], data.xmat[1 : count + 1].reshape(-1, 3, 3)
-        middle = (data.geom_xpos[self._planes] * normal).sum(1) - at @ normal.T + self._apart - self._below
+        middle = (data.geom_xpos[self._planes] * normal).sum(1) - at @ normal.T + self._apart
         low = np.flatnonzero((middle + self._radius[:, None] > 0).any(1) & ~fixed)
         row, _ = _ranges(self._first_corner[low], self._first_corner[low + 1])
         of = self._corner_of[row]

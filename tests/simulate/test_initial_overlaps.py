@@ -24,7 +24,7 @@ def test_the_allowed_overlap_is_the_least_since_the_start():
         for _ in range(2 * WINDOW):
             mujoco.mj_fwdPosition(model, data)
             overlaps.subtract(data, np.array([True, fixed, fixed]), data.ncon)
-        return overlaps.allowed[0]
+        return overlaps.allowed.depth[0]
 
     assert after(0.15) == pytest.approx(0.05)
     assert after(0.17, fixed=True) == pytest.approx(0.05)

@@ -33,7 +33,8 @@ def world(boxes: list[tuple], stances: list[Stance] | None = None):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     stances = stances or [stance(0.5, b[3], b[3], b) for b in boxes]
-    return model, data, RestingBodies(model, data, stances, range(1, len(boxes) + 1))
+    pairs, normals = model.geom_bodyid[data.contact.geom], data.contact.frame[:, :3]
+    return model, data, RestingBodies(model, stances, pairs, normals, range(1, len(boxes) + 1))
 
 
 def steps_until_released(wrench: tuple, friction: float, most: int = 300) -> int | None:

@@ -190,14 +190,14 @@ def cross() -> Surface:
     return union(*((s, lambda p, half=half: (p.abs() < half - 1e-4).all(1)) for half, s in (bar, post)))
 
 
-def test_a_body_of_several_parts_slides_by_v2_over_2_mu_g(tmp_path):
+def test_a_body_that_is_not_convex_slides_by_v2_over_2_mu_g(tmp_path):
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), velocity=("object=1 1,0,0",), friction=0.3, steps=40)
     assert float(t.com[-1, 0, 0] - t.com[0, 0, 0]) == pytest.approx(1 / (2 * 0.3 * G), rel=0.03)
     assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
 
 
 @pytest.mark.usefixtures("usual_bodies")
-def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path):
+def test_bodies_that_are_not_convex_do_not_rebound_from_each_other(tmp_path):
     """The contacts of their surfaces are inelastic: a cross that falls onto another by .12 stays on it."""
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), cross().moved((0, 0, 0.2)), loss=0.1, steps=18)
     z, height = t.com[:, 1, 2], 0.075 + 0.15 * 0.05  # what is thicker than its Gaussians' centres
@@ -205,7 +205,7 @@ def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path):
     assert hit < 12 and float(z[hit:].max()) < height and float(z[-1]) > 0.07
 
 
-def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):
+def test_a_body_that_is_not_convex_gains_no_energy_on_the_floor(tmp_path):
     """Springs of contacts that come and go during a collision would make a tumbling cross bounce ever higher."""
     t = roll(tmp_path, cross().moved((0, 0, 0.5)), loss=0.1, steps=100, velocity=("object=1 1,0,0",),
              force=("object=1 force=0,0,0 torque=.3,.2,0 to=0.04",))  # fmt: skip
@@ -282,7 +282,7 @@ SUBSTEPS_OF_A_CUBE = [  # of side .1 m and .5 kg on the floor: sqrt(size / accel
 def test_substeps_follow_from_acceleration_and_speed(tmp_path, caplog, options, expected):
     caplog.set_level(logging.INFO)
     roll(tmp_path, cube(0.1, 0, 0.0), steps=1, **options)
-    (line,) = [r.getMessage() for r in caplog.records if "convex parts, substep" in r.getMessage()]
+    (line,) = [r.getMessage() for r in caplog.records if "not convex, substep" in r.getMessage()]
     found = int(line.split("(")[1].split()[0])
     assert found == pytest.approx(expected, abs=max(1.0, 0.02 * expected))
     assert float(line.split("substep ")[1].split()[0]) == pytest.approx(0.02 / found, rel=0.01)
@@ -303,7 +303,7 @@ def test_the_fastest_object_decides_on_the_substeps(tmp_path, caplog):
 def test_an_object_below_the_floor_keeps_its_body_and_returns_to_where_it_stood(tmp_path, caplog):
     """A bar upright on the ground beside a table, lifted by half its height; what stands on the table does not fall.
 
-    One of these has several parts, whose surface is looked up.
+    One of these is not convex.
     """
     caplog.set_level(logging.INFO)
     bar = box((0.1, 0.1, 0.3), 0.02).moved((0.3, 0.0, -0.25))
@@ -315,7 +315,7 @@ def test_an_object_below_the_floor_keeps_its_body_and_returns_to_where_it_stood(
 
 
 def rail() -> Surface:
-    """A bar of several convex parts along x, 1.2 x .2 x .04, with a rim at its left end; its top is at 0."""
+    """A bar that is not convex along x, 1.2 x .2 x .04, with a rim at its left end; its top is at 0."""
     pieces = ((1.2, 0.2, 0.04), (0.0, 0.0, -0.02)), ((0.04, 0.2, 0.1), (-0.58, 0.0, 0.01))
     return union(*((box(sides, 0.01).moved(at), partial(strictly_inside, sides=sides, at=at)) for sides, at in pieces))
 
@@ -324,7 +324,7 @@ def strictly_inside(points: torch.Tensor, sides: tuple, at: tuple) -> torch.Tens
     return ((points - torch.tensor(at)).abs() < torch.tensor(sides) / 2 - 1e-4).all(1)
 
 
-def test_a_ball_rests_on_a_body_of_several_parts_whatever_sticks_out_of_its_surface(tmp_path):
+def test_a_ball_rests_on_a_body_that_is_not_convex_whatever_sticks_out_of_its_surface(tmp_path):
     """A tuft of .08 radii points downwards, on which it would tip over."""
     below = BALL.points[:, 2] < 0.002
     points = BALL.points.clone()
@@ -336,7 +336,7 @@ def test_a_ball_rests_on_a_body_of_several_parts_whatever_sticks_out_of_its_surf
 
 @pytest.mark.usefixtures("usual_bodies")
 @pytest.mark.parametrize("friction", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
-def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
+def test_bodies_that_are_not_convex_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
     t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), cross().moved((-0.3, 0, 0.325)), pin=("1",), friction=friction,
              velocity=("object=2 1,0,0",), steps=20 + math.ceil(1 / (friction * G * 0.02)))  # fmt: skip
     assert float(t.com[-1, 1, 0] - t.com[0, 1, 0]) == pytest.approx(1 / (2 * friction * G), rel=0.05)
@@ -362,7 +362,7 @@ def test_friction_adds_no_energy_to_tumbling_bodies(tmp_path):
     assert float((energy - least).max()) < 0.01 * float(energy[0] - energy.min())
 
 
-def test_a_dropped_body_of_several_parts_rests_when_its_rebounds_are_over(tmp_path):
+def test_a_dropped_body_that_is_not_convex_rests_when_its_rebounds_are_over(tmp_path):
     """Rebounds of restitution e after a fall of time T last T (1 + e) / (1 - e) in all."""
     e, fall = math.exp(-math.pi * 0.4 / math.sqrt(1 - 0.4**2)), math.sqrt(2 * 0.1 / G)
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), lift=("1=0.1",), loss=0.1, dt=0.01, steps=60)

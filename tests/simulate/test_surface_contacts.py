@@ -159,11 +159,12 @@ def test_voxels_around_a_symmetric_body_are_symmetric():
     line = 0.1 * np.arange(-4, 4.5)
     slab = np.stack(np.meshgrid(line, line, line[2:-2], indexing="ij"), -1).reshape(-1, 3)
     body = SolidSurface(slab + 0.05, 0.1, box((0.9, 0.9, 0.5), 0.03).points.double().numpy() + 0.05)
-    x, depth, inside, _ = body.body_voxels()
+    x, inside, _ = body.body_voxels()
     cells = np.round((x - 0.05) / 0.1).astype(int)
     assert len(x) == 11 * 11 * 7 and np.abs(cells).max(0).tolist() == [5, 5, 3]
     kept = {tuple(c) for c in cells[inside]}
     assert kept == {tuple(np.round((p) / 0.1).astype(int)) for p in slab}
+    depth = body.depth(x)
     assert (depth[inside] > 0).all() and depth.max() == pytest.approx(0.25, abs=0.02)
 
 

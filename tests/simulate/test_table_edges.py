@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.core.physics.convex_parts import convex_parts
+from stages.core.physics.rigid_shapes import rigid_shapes
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
@@ -54,10 +54,10 @@ def test_a_block_that_stops_over_the_edge_is_held_by_it(tmp_path, monkeypatch):
     """Its centre comes to rest .04 before the edge, with two of its four lower corners beyond it."""
 
     def of_corners(*args):
-        sides = ((p, torch.stack(torch.cat(p.hulls).aminmax(dim=0), 1)) for p in convex_parts(*args))
-        return [replace(p, hulls=(torch.cartesian_prod(*corners),)) for p, corners in sides]
+        sides = ((p, torch.stack(p.hull.aminmax(dim=0), 1)) for p in rigid_shapes(*args))
+        return [replace(p, hull=torch.cartesian_prod(*corners)) for p, corners in sides]
 
-    monkeypatch.setattr("stages.simulate.rigid.convex_parts", of_corners)
+    monkeypatch.setattr("stages.simulate.rigid.rigid_shapes", of_corners)
     speed = math.sqrt(2 * 0.4 * G * (EDGE - 0.04 - 0.2))
     t = roll(tmp_path, block(0.2), velocity=(f"object=1 {speed},0,0",), steps=36)
     assert float(t.com[-1, 0, 0]) == pytest.approx(EDGE - 0.04, abs=0.006)

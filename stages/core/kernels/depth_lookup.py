@@ -59,11 +59,17 @@ class DepthLookup:
         Returns their rows (m,), positions (m, 3), directions (m, 3) out of b in its frame, depths (m,) in it, and rows
         (m,) of the nearest nodes.
         """
+        return self.near(points, a, b, turn, at, 0.0)
+
+    def near(
+        self, points: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray, gap: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """As `inside`, with the points that are less than `gap` outside."""
         local = self._relative(points, a, b, turn, at)
         node, f = self._cells(b, local)
         within = (np.abs(f - 0.5) <= 0.5).all(1)
-        depth = np.where(within, interpolated(self.depth[node], f), 0.0)
-        k = np.flatnonzero(depth > 0)
+        depth = np.where(within, interpolated(self.depth[node], f), -np.inf)
+        k = np.flatnonzero(depth > -gap)
         out = -slope(self.smooth[node[k]], f[k])
         out /= np.linalg.norm(out, axis=1, keepdims=True).clip(1e-12)
         x = turned(turn[a[k]], points[k]) + at[a[k]]

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from stages.core.geometry.extremes import fibonacci
 from stages.core.kernels.threads import small_operations
-from stages.core.physics.convex_cuts import fibonacci
 
 DIRECTIONS = fibonacci(200)
 NEAREST = cKDTree(DIRECTIONS)

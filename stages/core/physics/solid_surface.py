@@ -128,9 +128,9 @@ class SolidSurface:
         """Centres (k, 3) of the voxels at more than this depth."""
         return self.voxels[self._coarse_depth(self.voxels) > depth]
 
-    def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Centres (m, 3) of the voxels in and around the body, their depths (m,), which (m,) make up the body, and the
-        filled share (m,) of each.
+    def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centres (m, 3) of the voxels in and around the body, which (m,) make it up, and the filled share (m,) of
+        each.
 
         Those are the ones inside, and in sheets thinner than a voxel those of the coarse body.
         """
@@ -145,7 +145,7 @@ class SolidSurface:
         share[cut] = (
             (2 * self._at(self._depth_grid, octants.reshape(-1, 3)) / self.h + 0.5).clip(0, 1).reshape(-1, 8).mean(1)
         )
-        return x, depth, inside[near], share
+        return x, inside[near], share
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Points (s, 3) on the surface, one in each voxel that has any, and normals (s, 3), outwards."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stages.core.geometry.extremes import fibonacci
 from stages.core.physics.ball_fit import Ball, fitted_ball
-from stages.core.physics.convex_cuts import fibonacci
 
 UNIT = fibonacci(4000)
 GOLDEN = (1 + 5**0.5) / 2

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from stages.core.physics import convex_parts, particles
+from stages.core.physics import particles, rigid_shapes
 from stages.core.physics.particles import MIN_PARTICLE_OPACITY, MIN_PARTICLES, scene_size, surface_points, usable
 from stages.core.scene.gaussians import concatenate
 from tests.core.physics.test_particles import scene, splats
@@ -29,15 +29,6 @@ def filled(shape, *blocks):
 
 def grid(*sides, step):
     return torch.from_numpy(block(*sides) * float(step)).float()
-
-
-def test_points_are_close_to_voxels_whose_centre_is_less_than_an_edge_away():
-    rng = np.random.default_rng(0)
-    cells = block(4, 3, 5, low=(-2, 1, 0))[::2] + 0.5
-    points = rng.uniform(-4, 7, (500, 3))
-    found = np.zeros((len(points), len(cells)), bool)
-    found[convex_parts._close(points, cells)] = True
-    assert np.array_equal(found, np.linalg.norm(points[:, None] - cells, axis=-1) < 1) and found.any()
 
 
 def test_spacing_is_the_median_distance_to_the_nearest_other():
@@ -146,7 +137,7 @@ def test_voxels_of_two_bodies_go_to_the_smaller_one():
 
 
 def test_corners_of_voxels():
-    found = convex_parts._corners(np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), 0.2)
+    found = rigid_shapes._corners(np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), 0.2)
     expected = {tuple(np.round(c + 0.1 * np.array(s), 6)) for c in ([1, 2, 3], [0, 0, 0])
                 for s in itertools.product((-1, 1), repeat=3)}  # fmt: skip
     assert len(found) == 16 and {tuple(np.round(c, 6)) for c in found} == expected
@@ -154,16 +145,16 @@ def test_corners_of_voxels():
 
 def test_moments_of_the_hull_of_a_box_and_of_a_tetrahedron():
     box = np.array(list(itertools.product((0.0, 2.0), (1.0, 4.0), (-1.0, 3.0))))
-    volume, com, inertia = convex_parts._solid_moments(convex_parts._hull(box))
+    volume, com, inertia = rigid_shapes._solid_moments(rigid_shapes._hull(box))
     assert volume == pytest.approx(24) and com.tolist() == pytest.approx([1, 2.5, 1])
     np.testing.assert_allclose(inertia, 24 / 12 * np.diag([9 + 16, 4 + 16, 4 + 9]), rtol=1e-5, atol=1e-5)
     corner = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    volume, com, inertia = convex_parts._solid_moments(convex_parts._hull(corner))
+    volume, com, inertia = rigid_shapes._solid_moments(rigid_shapes._hull(corner))
     assert volume == pytest.approx(1 / 6) and com.tolist() == pytest.approx([0.25] * 3)
     np.testing.assert_allclose(np.diag(inertia), 2 * (1 / 60 - 1 / 96), rtol=1e-5)  # integral of x^2 is 1 / 60
     np.testing.assert_allclose(inertia[0, 1], -(1 / 120 - 1 / 96), rtol=1e-5)  # of x y 1 / 120
 
 
 def test_no_hull_of_points_in_a_plane():
-    assert convex_parts._hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])) is None
-    assert convex_parts._hull(np.zeros((2, 3))) is None
+    assert rigid_shapes._hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])) is None
+    assert rigid_shapes._hull(np.zeros((2, 3))) is None

@@ -1,0 +1,28 @@
+"""Directions spread evenly over a sphere, and the points that are the farthest in them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+EQUALLY_FAR = 1e-5  # difference of heights relative to the largest, below which they count as equal
+
+
+def fibonacci(count: int) -> np.ndarray:
+    """Unit vectors (count, 3), spread evenly (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
+
+
+EXTREMES = np.concatenate([np.eye(3), -np.eye(3), fibonacci(200)]).astype(np.float32)
+
+
+def extreme_rows(points: np.ndarray) -> np.ndarray:
+    """Sorted rows of those points (n, 3) that are the farthest in one of EXTREMES, the first of those equally far.
+
+    Rounding therefore does not choose among the points of a flat side.
+    """
+    height = EXTREMES @ (points - points.mean(0)).T
+    top = height.max(1, keepdims=True)
+    return np.unique((height >= top - EQUALLY_FAR * top.max()).argmax(1))

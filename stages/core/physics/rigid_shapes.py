@@ -1,0 +1,178 @@
+"""Each object as a rigid body: its convex hull, and the volume, centre of mass and inertia of what it fills.
+
+A round object is a ball (`ball_fit.py`). Of the others, one that fills its convex hull has the moments of that, the
+rest have those of their filled voxels. Lengths are in the unit of the Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from torch import Tensor
+
+from stages.core.geometry.extremes import EXTREMES, extreme_rows
+from stages.core.kernels.threads import parallel_map
+from stages.core.physics.ball_fit import DENT, Ball, fitted_ball
+from stages.core.physics.keypoints import farthest_points
+from stages.core.physics.solid_surface import solid_surface
+from stages.core.scene.cached import cached_in_scene
+from stages.core.scene.scene import Scene
+
+CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
+MAX_VERTICES = 200  # of a hull: a cylinder or egg is round to 1 %
+CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
+Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
+
+
+@dataclass(frozen=True)
+class Solid:
+    """The filled body of an object."""
+
+    voxels: np.ndarray  # (m, 3), centres
+    h: float  # edge of a voxel
+    surface: np.ndarray  # (n, 3), points on it
+    seen: np.ndarray  # (k, 3), centres of its Gaussians
+    moments: Moments
+
+
+@dataclass(frozen=True)
+class RigidShape:
+    """Convex hull of an object and the properties of its filled body at density 1."""
+
+    hull: Float[Tensor, "v 3"]  # vertices
+    convex: bool  # the object fills its hull
+    volume: float
+    com: Float[Tensor, "3"]
+    inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
+    ball: Ball | None = None  # that a round object is; `hull` has its points in EXTREMES
+
+
+@cached_in_scene
+def rigid_shapes(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[RigidShape]:
+    """The shape of each object, in the order of scene.objects.
+
+    What lies below the height `bottom` is cut off. Raises InputError for an object without any usable Gaussian.
+    """
+    solids, found = _solids(scene, seed, bottom), balls(scene, seed, bottom)
+    return [_shape(solid, seed) if ball is None else _ball_shape(ball)
+            for solid, ball in zip(solids, found, strict=True)]  # fmt: skip
+
+
+@cached_in_scene
+def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | None]:
+    """The balls among the objects, in the order of scene.objects; arguments and errors as those of `rigid_shapes`."""
+    solids, out = _solids(scene, seed, bottom), []
+    for row, solid in enumerate(solids):
+        ball = fitted_ball(solid.surface, bottom, all_seen=scene.cameras is None)
+        clear = ball is not None and ball.clear_of(_around(solids, row, DENT * ball.radius))
+        out.append(ball if clear else None)
+    return out
+
+
+@cached_in_scene
+def convex_hulls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexHull | None]:
+    """The hulls of the objects that fill them, in the order of scene.objects; arguments as of `rigid_shapes`.
+
+    Of the points in EXTREMES: hulls of all points of round objects have a face for every few Gaussians.
+    """
+    return [_filled_hull(solid, _extreme(solid.seen)) for solid in _solids(scene, seed, bottom)]
+
+
+@cached_in_scene
+def _solids(scene: Scene, seed: int, bottom: float) -> list[Solid]:
+    return parallel_map(lambda id: _solid(scene, id, seed, bottom), [o.id for o in scene.objects])
+
+
+def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
+    body = solid_surface(scene, object_id, seed)
+    voxels, inside, share = body.fitted.body_voxels()
+    kept = voxels[:, 2] > min(bottom, float(voxels[inside, 2].max()) - body.h)
+    inside = inside[kept]
+    seen, surface = (np.column_stack([p[:, :2], p[:, 2].clip(min=bottom)]) for p in (body.seen, body.points))
+    voxels = voxels[kept]
+    moments = _voxel_moments(voxels, share[kept], body.h)
+    return Solid(voxels[inside], body.h, surface, seen if len(seen) else voxels, moments)
+
+
+def _around(solids: list[Solid], row: int, margin: float) -> np.ndarray:
+    """Centres (n, 3) of the voxels of the other solids up to a margin outside the bounds of one of them, and not in or
+    next to it.
+    """
+    own = solids[row]
+    low, high = own.voxels.min(0) - margin, own.voxels.max(0) + margin
+    near = [s.voxels[((s.voxels > low) & (s.voxels < high)).all(1)] for k, s in enumerate(solids) if k != row]
+    others = np.concatenate([np.empty((0, 3)), *near])
+    return others[cKDTree(own.voxels).query(others, distance_upper_bound=own.h)[0] == np.inf]
+
+
+def _ball_shape(ball: Ball) -> RigidShape:
+    volume, centre = 4 / 3 * np.pi * ball.radius**3, torch.from_numpy(ball.centre).float()
+    hull = centre + ball.radius * torch.from_numpy(EXTREMES)
+    return RigidShape(hull, True, volume, centre, 0.4 * volume * ball.radius**2 * torch.eye(3), ball)
+
+
+def _shape(solid: Solid, seed: int) -> RigidShape:
+    filled = _filled_hull(solid, solid.seen)
+    if filled is not None:
+        return RigidShape(_vertices(filled, seed), True, *_solid_moments(filled))
+    hull = _hull(_extreme(solid.surface)) or ConvexHull(_extreme(_corners(solid.voxels, solid.h)))
+    return RigidShape(_vertices(hull, seed), False, *solid.moments)
+
+
+def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
+    """The convex hull of its points, if it fills that."""
+    hull = _hull(points)
+    return hull if hull is not None and hull.volume * CONVEX < solid.moments[0] else None
+
+
+def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:
+    """Those of voxels (m, 3) of edge h of which a share (m,) is filled."""
+    x, w = torch.from_numpy(voxels), torch.from_numpy(share / share.sum())
+    com = w @ x
+    r = x - com
+    volume = float(share.sum()) * h**3
+    second = (w[:, None] * r).mT @ r + h**2 / 12 * torch.eye(3, dtype=torch.float64)
+    return volume, com.float(), (volume * (second.trace() * torch.eye(3, dtype=torch.float64) - second)).float()
+
+
+def _hull(points: np.ndarray) -> ConvexHull | None:
+    """The convex hull; None where the points span no volume."""
+    try:
+        return ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+
+
+def _vertices(hull: ConvexHull, seed: int) -> Float[Tensor, "v 3"]:
+    """At most MAX_VERTICES vertices of a hull, spread evenly."""
+    corners = torch.from_numpy(hull.points[hull.vertices]).float()
+    return corners[farthest_points(corners, MAX_VERTICES, seed)]
+
+
+def _solid_moments(hull: ConvexHull) -> Moments:
+    """Volume, centre of mass and inertia about it of a hull, by the tetrahedra from its middle to its triangles."""
+    middle = hull.points[hull.vertices].mean(0)
+    t = hull.points[hull.simplices] - middle  # (m, 3, 3): corners of each triangle
+    volume = np.abs(np.linalg.det(t)) / 6
+    total = volume.sum()
+    com = (volume[:, None] * t.sum(1)).sum(0) / (4 * total)
+    # integral of x x^T over a tetrahedron with one corner at the origin: V / 20 (sum of corners' x x^T + s s^T)
+    s = t.sum(1)
+    second = np.einsum("n,nci,ncj->ij", volume, t, t) + np.einsum("n,ni,nj->ij", volume, s, s)
+    second = second / 20 - total * np.outer(com, com)
+    inertia = np.trace(second) * np.eye(3) - second
+    return float(total), torch.from_numpy(middle + com).float(), torch.from_numpy(inertia).float()
+
+
+def _extreme(points: np.ndarray) -> np.ndarray:
+    """The points that are extreme in one of EXTREMES."""
+    return points[extreme_rows(points)] if len(points) > len(EXTREMES) else points
+
+
+def _corners(voxels: np.ndarray, h: float) -> np.ndarray:
+    """Corners (8 m, 3) of voxels (m, 3) of edge h."""
+    return (voxels[:, None] + h * CORNERS).reshape(-1, 3)

@@ -1,9 +1,9 @@
 """Contacts of the surfaces of rigid bodies that do not fill their convex hull.
 
-Where one of two bodies is not convex, samples of each surface are looked up in the signed distance of the other one,
-and those inside are contacts, with the normals of the faces that meet (`surface_faces.py`). The samples that span the
-contact of a pair take part. The outermost samples of a body that is not convex touch the floor and walls. MuJoCo's
-contacts of the hulls of such pairs are excluded; those of convex bodies and those with the background stay.
+Where one of two bodies is not convex, samples of each surface are looked up in the signed distance of the other one
+(`depth_lookup.py`), and those inside are contacts, of which the ones that span the contact of a pair take part. The
+outermost samples of a body that is not convex touch the floor and walls. MuJoCo's contacts of the hulls of such pairs
+are excluded; those of convex bodies and those with the background stay.
 
 Contacts between surfaces are inelastic: critically damped, and pushed apart at no more than the speed at which contacts
 do not rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies
@@ -25,8 +25,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.geometry.extremes import fibonacci
-from stages.core.geometry.surface_faces import CURVED, FACES, OPPOSED, nearest_points, surface_faces
-from stages.core.kernels.depth_lookup import depth_lookup, turned
+from stages.core.geometry.surface_faces import nearest_points, surface_faces
+from stages.core.kernels.depth_lookup import Samples, depth_lookup, turned
 from stages.core.physics.solid_surface import SolidSurface
 from stages.simulate.initial_overlaps import AllowedOverlaps
 
@@ -87,20 +87,19 @@ class SurfaceContacts:
         count = len(shapes)
         groups = [_groups(s.points) for s in shapes]
         shapes = [_ordered(s, order) for s, (order, *_) in zip(shapes, groups, strict=True)]
-        self._points, self._normals, self._flatness, self._faces = (
-            np.concatenate([getattr(s, n) for s in shapes]) for n in ("points", "normals", "flatness", "faces")
-        )
+        per_sample = [np.concatenate([getattr(s, n) for s in shapes]) for n in Samples._fields[:-1]]
+        self._points = per_sample[0]
         self._first = np.cumsum([0, *(len(s.points) for s in shapes)])
         self._first_group = np.cumsum([0, *(len(g[1]) for g in groups)])
         self._begin = np.concatenate([first + g[1] for first, g in zip(self._first, groups, strict=False)])
         self._ends = np.append(self._begin[1:], len(self._points))
         self._middle, self._reach = (np.concatenate([g[k] for g in groups]) for k in (2, 3))
         self._radius = np.array([np.linalg.norm(s.points, axis=1).max(initial=0) for s in shapes])
-        self._nearest = np.concatenate(
-            [np.where(s.nearest < 0, -1, f + s.nearest).ravel() for f, s in zip(self._first, shapes, strict=False)]
-        )
+        nearest = [np.where(s.nearest < 0, -1, f + s.nearest).ravel()
+                   for f, s in zip(self._first, shapes, strict=False)]  # fmt: skip
+        samples = Samples(*per_sample, np.concatenate(nearest))
         self._lookup = depth_lookup([s.depth for s in shapes], np.array([s.low for s in shapes]),
-                                    np.array([s.h for s in shapes]))  # fmt: skip
+                                    np.array([s.h for s in shapes]), samples)  # fmt: skip
         self._ball, self._centre = np.array([s.radius for s in shapes]), np.array([s.centre for s in shapes])
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
@@ -193,12 +192,9 @@ class SurfaceContacts:
         lists, _ = self._near(data, pairs, np.zeros(len(pairs)))
         a, b = np.repeat(pairs, [len(rows) for rows, _ in lists], axis=0).T
         sample = np.concatenate([NONE[0], *(rows for rows, _ in lists)])
-        turn, at = self._poses(data)
-        k, _, outwards, _, node = self._lookup.near(self._points[sample], a, b, turn, at, MARGIN)
-        a, b, sample = a[k], b[k], sample[k]
-        normal, facing = self._facing(sample, self._nearest[node], outwards, turn[b].transpose(0, 2, 1) @ turn[a])
-        k = np.flatnonzero(facing > 0)
-        return np.stack([b[k], a[k]], 1) + 1, turned(turn[b[k]], normal[k])
+        found = self._lookup.near(sample, a, b, *self._poses(data), MARGIN)
+        k = found.facing > 0
+        return np.stack([b[found.row[k]], a[found.row[k]]], 1) + 1, found.normal[k]
 
     def _update_lists(self, data, fixed: np.ndarray) -> None:
         self._way = path = self._path[:, None] + self._path
@@ -250,12 +246,9 @@ class SurfaceContacts:
         """
         k = np.flatnonzero(self._way[tuple(self._pairs.T)][self._pair] >= self._from)
         a, b = self._pairs[self._pair[k]].T.copy()
-        sample = self._sample[k]
         turn, at = self._poses(data)
-        k, x, outwards, depth, node = self._lookup.inside(self._points[sample], a, b, turn, at)
-        a, b, sample = a[k], b[k], sample[k]
-        normal, facing = self._facing(sample, self._nearest[node], outwards, turn[b].transpose(0, 2, 1) @ turn[a])
-        normal = turned(turn[b], normal)
+        row, x, normal, depth, facing = self._lookup.inside(self._sample[k], a, b, turn, at)
+        a, b = a[row], b[row]
         for body, side in ((a, 1), (b, -1)):  # a ball touches where the normal through its centre meets its surface
             row = np.flatnonzero(self._ball[body] > 0)
             of = body[row]
@@ -263,27 +256,6 @@ class SurfaceContacts:
             if side < 0:
                 x[row] -= depth[row, None] * normal[row]
         return x, normal, depth * (facing / FACING).clip(0, 1), a, b
-
-    def _facing(self, sample: np.ndarray, other: np.ndarray, outwards: np.ndarray, turn: np.ndarray):
-        """Normals (k, 3) out of bodies b, in their frames, of contacts of samples (k,) of bodies a near samples (k,) of
-        b, and the cosines (k,) of the angles at which they face each other. `turn` (k, 3, 3) is from a to b.
-
-        Where b has an edge its depths increase in an oblique direction, `outwards` (k, 3). The normal is that of a
-        face: of faces that are parallel the one of the flatter surface, else that of a if its sample is on one.
-        """
-        own, faces = turned(turn, self._normals[sample]), self._faces[sample]
-        others = np.where(other[:, None, None] < 0, 0.0, self._faces[other])
-        cosine = -np.einsum("kij,kaj,kbi->kab", turn, faces, others)
-        cosine[~faces.any(2)] = -np.inf
-        cosine.swapaxes(1, 2)[~others.any(2)] = -np.inf
-        row, best = np.arange(len(sample)), cosine.reshape(len(sample), FACES**2).argmax(1)
-        most = cosine.reshape(len(sample), FACES**2)[row, best]
-        flatness = self._flatness[sample]
-        on_face, flatter = flatness > 0, self._flatness[other] > flatness + CURVED
-        normal = np.where(on_face[:, None], -own, outwards)
-        parallel = (most > OPPOSED) & (~on_face | flatter)
-        normal[parallel] = others[row, best % FACES][parallel]
-        return normal, np.where(np.isfinite(most), most, -(own * outwards).sum(1))
 
     def _poses(self, data) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (o, 3, 3) and positions (o, 3) of the bodies; the model has others after them."""

@@ -29,7 +29,7 @@ class TableEdges:
         self._geom = [np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(len(corners))]
         self._floor = float(model.geom_pos[0, 2])
         self._left = np.zeros(model.nbody, bool)
-        lowest = [self._world(data, i)[..., 2].min() for i in range(len(corners))]
+        lowest = [self._heights(data, i).min(initial=np.inf) for i in range(len(corners))]
         self._sunk = np.maximum(self._floor - np.array(lowest), 0)  # which is no contact
         signature = (model.geom_bodyid[0] << 16) + np.arange(1, len(corners) + 1)
         self._on_table = ~np.isin(signature, model.exclude_signature)
@@ -48,7 +48,7 @@ class TableEdges:
         contact.efc_address[rows] = -1  # which MuJoCo leaves undefined where it excludes all contacts
         over = self._on_table & ~self._left[1 : count + 1] & ~fixed[1 : count + 1]
         over &= (np.abs(beyond) < self._radius) & (centre[:, 2] - self._floor < self._radius)
-        found = [(i, x) for i in np.flatnonzero(over) for x in self._on_edges(self._world(data, i), self._sunk[i])]
+        found = [(i, x) for i in np.flatnonzero(over) for x in self._on_edges(self._low(data, i), self._sunk[i])]
         if not found:
             return
         i, x = np.array([i for i, _ in found]), np.array([x for _, x in found])
@@ -56,9 +56,16 @@ class TableEdges:
         up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
         add_contacts(self._mujoco, self._model, data, x, up, depth, np.zeros(len(x), int), np.array(self._geom)[i])
 
-    def _world(self, data, row: int) -> np.ndarray:
-        """Ends (e, 2, 3) of the edges of a body's hull."""
-        return self._hulls[row] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
+    def _heights(self, data, row: int) -> np.ndarray:
+        """Those (v,) of the corners of a body's hull."""
+        return self._hulls[row][0] @ data.xmat[row + 1, 6:] + data.xpos[row + 1, 2]
+
+    def _low(self, data, row: int) -> np.ndarray:
+        """Ends (e, 2, 3) of those edges of a body's hull that can touch the floor."""
+        corners, edges = self._hulls[row]
+        low = self._heights(data, row) < self._floor - self._sunk[row]
+        edges = edges[low[edges].any(1)] if low.any() else edges[:0]
+        return corners[edges] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
 
     def _on_edges(self, ends: np.ndarray, sunk: float) -> list[np.ndarray]:
         """Of the points where edges (e, 2, 3) cross those of the table and are deeper than `sunk`, the outer ones."""
@@ -76,11 +83,13 @@ class TableEdges:
         return found
 
 
-def _hull_edges(points: np.ndarray) -> np.ndarray:
-    """Ends (e, 2, 3) of the edges of the triangulated convex hull of points; none of points in a plane."""
+def _hull_edges(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (v, 3) of the triangulated convex hull of points, and its edges (e, 2); none of points in a plane."""
     try:
-        triangles = ConvexHull(points).simplices
+        hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return np.zeros((0, 2, 3))
-    pairs = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1), axis=0)
-    return points[pairs]
+        return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+    row = np.zeros(len(points), np.int64)
+    row[hull.vertices] = np.arange(len(hull.vertices))
+    edges = np.unique(np.sort(hull.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1), axis=0)
+    return points[hull.vertices], row[edges]

@@ -7,7 +7,7 @@ much less; in other objects, so does one below the floor at rest, where bodies e
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
-energy that was converted.
+energy that was converted. Bodies turn as filled ones, whose mass their keypoints, on the surface, do not show.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ class PlausibilityMonitor:
         self._spread = np.zeros(count)
         self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # of the last quarter
         self._energy: list[float] = []
-        self._before: tuple[list[np.ndarray], np.ndarray] | None = None
+        self._second_moment = cache(self._second_moment_of)
+        self._before: tuple[list[np.ndarray], np.ndarray, np.ndarray] | None = None
 
     def add(self, state: FrameState) -> None:
         """The next frame."""
@@ -76,8 +77,8 @@ class PlausibilityMonitor:
         self._measure_penetration(points, com, R)
         mass = np.ones(len(com)) if state.mass is None else state.mass.double().numpy()
         if self._before is not None:
-            self._energy.append(self._mechanical_energy(points, self._before[0], mass))
-        self._before = points, com
+            self._energy.append(self._mechanical_energy((points, com, R), self._before, mass))
+        self._before = points, com, R
 
     def _measure_penetration(self, points: list[np.ndarray], com: np.ndarray, R: np.ndarray) -> None:
         moved = np.linalg.norm(com - self._origin, axis=1) > MOVED * self._size
@@ -130,11 +131,24 @@ class PlausibilityMonitor:
         """How far the keypoints (k,) of an object are outside its own body."""
         return np.maximum(-self._surface(row).depth(self._rest[row]), 0)
 
-    def _mechanical_energy(self, points: list[np.ndarray], before: list[np.ndarray], mass: np.ndarray) -> float:
-        """Kinetic and potential energy per unit of mass between two frames, by the keypoints [units^2 / s^2]."""
-        each = [(((p - q) ** 2).sum(1).mean() / (2 * self._options.dt**2) + self._g * (p + q)[:, 2].mean() / 2)
-                if len(p) else 0.0 for p, q in zip(points, before, strict=True)]  # fmt: skip
-        return float(mass @ np.array(each) / mass.sum())
+    def _second_moment_of(self, row: int) -> np.ndarray:
+        """Mean of x x^T (3, 3) over an object's filled body, about its centre at rest."""
+        body = self._surface(row)
+        return np.cov(body.voxels.T, bias=True) + body.h**2 / 12 * np.eye(3)
+
+    def _mechanical_energy(self, now: tuple, before: tuple, mass: np.ndarray) -> float:
+        """Kinetic and potential energy per unit of mass between two frames [units^2 / s^2], each given by the keypoints
+        of the objects, their centres of mass and their rotations. What keypoints move beside these is deformation.
+        """
+        points, com, R = ([a - b for a, b in zip(x, y, strict=True)] for x, y in zip(now, before, strict=True))
+        energy = self._g * (now[1] + before[1])[:, 2] / 2
+        for i, moved in enumerate(points):
+            if len(moved):
+                turning = np.trace(R[i] @ self._second_moment(i) @ R[i].T)
+                rigid = com[i] + (self._rest[i] - self._origin[i]) @ R[i].T
+                square = com[i] @ com[i] + turning + ((moved - rigid) ** 2).sum(1).mean()
+                energy[i] += square / (2 * self._options.dt**2)
+        return float(mass @ energy / mass.sum())
 
     def result(self) -> dict:
         """The measures: of each object by its id, and of the whole scene."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.forces import Force, ForcePrompts
@@ -129,17 +130,25 @@ def monitor_of(scene: Scene, prompts: ForcePrompts = ForcePrompts(), **options) 
     return PlausibilityMonitor(scene, choose_keypoints(scene, 64), prompts, SimulateOptions(**options))
 
 
-def test_energy_is_that_of_the_keypoints_weighted_by_mass(scene):
+def test_energy_is_that_of_filled_bodies_and_of_their_deformation_weighted_by_mass(scene):
+    """The lower cube turns by .1 and moves, the upper one falls while its keypoints move apart."""
     monitor = monitor_of(replace(scene, scale={"metres_per_unit": 0.5, "source": "stated"}), dt=0.1)
-    before = [np.array([[0.0, 0, 1], [0, 0, 3]]), np.array([[0.0, 0, 5]])]
-    after = [np.array([[0.2, 0, 1], [0, 0, 3.4]]), np.array([[0.0, 0, 4]])]
-    g = G / 0.5  # units
-    first = (0.2**2 + 0.4**2) / 2 / (2 * 0.1**2) + g * 2.1
-    second = 1 / (2 * 0.1**2) + g * 4.5
-    assert monitor._mechanical_energy(after, before, np.array([1.0, 1.0])) == pytest.approx((first + second) / 2)
-    assert monitor._mechanical_energy(after, before, np.array([3.0, 1.0])) == pytest.approx((3 * first + second) / 4)
-    empty = [np.zeros((0, 3)), after[1]]
-    assert monitor._mechanical_energy(empty, empty, np.array([1.0, 1.0])) == pytest.approx(g * 4 / 2)
+    com = np.array([[0.0, 0, 0.1], [0, 0, 0.3]])
+    turn = Rotation.from_rotvec([[0.0, 0, 0.1], [0, 0, 0]]).as_matrix()
+    monitor._origin = com
+    after_com = com + [[0.2, 0, 0], [0, 0, -0.1]]
+    apart = 0.03 * np.sign(np.arange(len(monitor._rest[1])) % 2 - 0.5)[:, None] * [0.0, 1, 0]
+    moved = [x + (r - c) @ R.T for x, r, c, R in zip(after_com, monitor._rest, com, turn, strict=True)]
+    before, after = (monitor._rest, com, np.stack([np.eye(3)] * 2)), ([moved[0], moved[1] + apart], after_com, turn)
+    g, square = G / 0.5, 2 * 0.1**2  # in units
+    chord = (2 * math.sin(0.05)) ** 2
+    first = (0.2**2 + chord * 0.2**2 / 6) / square + g * 0.1
+    second = (0.1**2 + 0.03**2) / square + g * 0.25
+    for mass in (1.0, 3.0):
+        found = monitor._mechanical_energy(after, before, np.array([mass, 1.0]))
+        assert found == pytest.approx((mass * first + second) / (mass + 1), rel=2e-3)
+    empty = [np.zeros((0, 3)), monitor._rest[1]], com, before[2]
+    assert monitor._mechanical_energy(empty, empty, np.array([1.0, 1.0])) == pytest.approx(g * 0.2)
 
 
 @pytest.mark.parametrize(("energy", "gain"), [

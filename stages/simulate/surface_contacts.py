@@ -271,7 +271,9 @@ class SurfaceContacts:
         low = np.flatnonzero((middle + self._radius[:, None] > 0).any(1) & ~fixed)
         row, _ = _ranges(self._first_corner[low], self._first_corner[low + 1])
         of = self._corner_of[row]
-        depth = middle[of] - np.einsum("ki,kpi->kp", self._corners[row], (normal @ turn)[of])
+        corners, down = self._corners[row], normal @ turn
+        along = np.stack([np.einsum("ki,ki->k", corners, down[of, p]) for p in range(len(normal))], 1)
+        depth = middle[of] - along
         k, plane = np.nonzero(depth > 0)
         return row[k], plane, depth[k, plane]
 

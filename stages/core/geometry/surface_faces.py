@@ -43,7 +43,8 @@ def surface_faces(
         new = np.flatnonzero(on_face[row] & ~known & (count < FACES))
         faces[new, count[new]] = normals[row[new]]
         count[new] += 1
-    small = (faces * normals[:, None]).sum(-1).max(1) < BETWEEN  # on a face that is too small to have inner points
+    # a face that is too small to have inner points; the normals of corners are those of no face
+    small = ((faces * normals[:, None]).sum(-1).max(1) < BETWEEN) & ~np.asarray(at_edge)
     faces[small, 1:], faces[small, 0] = faces[small, :-1], normals[small]
     return np.where(on_face, flatness, 0.0), faces
 

@@ -61,6 +61,15 @@ def test_the_end_of_a_thin_rod_is_a_face():
     assert (faces[:9] == [0, 0, -1]).all(2).any(1).all()
 
 
+def test_a_point_known_to_be_at_an_edge_far_from_every_face_has_none():
+    """The tip of a long thin cone: its own normal, along the axis, is that of no face."""
+    tip, far = np.zeros((30, 3)), 10 + np.random.default_rng(0).normal(size=(30, 3))
+    points, normals = np.concatenate([tip, far]), np.tile([0.0, 0, 1], (60, 1))
+    at_edge = np.arange(60) < 30
+    flatness, faces = surface_faces(points, normals, at_edge)
+    assert not faces[:30].any() and not flatness[:30].any() and faces[30:, 0].any(1).all()
+
+
 def test_a_ball_is_nearly_flat_and_less_so_than_a_plane():
     i = np.arange(2000) + 0.5
     z, turn = 1 - 2 * i / 2000, np.pi * (1 + 5**0.5) * i

@@ -161,12 +161,8 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     points, gap = _cloud(scene, object_id, seed)
     spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
-    gap = max(gap, CLOSED * spacing)
-    # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
-    ways = (True, False) if _stands(points, h, scene.floor) else (False,)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
-    bodies = [_closed_body(points - (first - h / 2), h, gap, standing, photographed=False)[:2] for standing in ways]
-    body, low = max(bodies, key=lambda found: found[0].sum())
+    body, low, _ = _closed_body(points - (first - h / 2), h, gap, _stands(points, h, scene.floor), photographed=False)
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
@@ -193,7 +189,7 @@ def _closed_body(
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
-    That of a `standing` object is closed by the floor. One that would tip over although it stood when `photographed`
+    A `standing` one is closed by the floor. One that would tip over although it stood when `photographed`
     is extended down to the floor; the last value is whether it was.
     """
     cells = np.floor(points / h).astype(np.int64)
@@ -208,8 +204,9 @@ def _closed_body(
     shell = np.zeros(shape, bool)
     shell.ravel()[at] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    body = _largest(_fill(shell, bridge, standing))
-    body = _trim(body, points / h - low - cells - 0.5, at)
+    # closed by the floor where it stands, or with wider leaks as what hangs is: what fills more
+    filled = (_largest(_fill(shell, bridge, way)) for way in ((True, False) if standing else (False,)))
+    body = max((_trim(b, points / h - low - cells - 0.5, at) for b in filled), key=np.count_nonzero)
     at = torch.from_numpy(np.argwhere(body)).float()
     extended = photographed and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
     if extended:
@@ -230,13 +227,15 @@ def _closed_body(
 
 @cached_in_scene
 def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float]:
-    """`surface_points` of an object, and the gap between them."""
+    """`surface_points` of an object, and the gap between them that is closed."""
     points = surface_points(scene, object_id, seed)
-    return points, _gap(points)
+    return points, max(_gap(points), CLOSED * _spacing(usable_means(scene, object_id).double()))
 
 
 def _spacing(means: Float[Tensor, "n 3"]) -> float:
-    """Median distance of Gaussians to the nearest other; 0 for one alone."""
+    """Median distance of Gaussians to the nearest other; 0 for one alone or none."""
+    if len(means) < 2:
+        return 0.0
     some = means[:: max(1, len(means) // 2000)]
     _, index = knn(means, some, 2)
     return float((some - means[index[:, -1]]).norm(dim=1).median())

@@ -119,6 +119,23 @@ def test_a_box_is_filled_at_every_resolution(floor):
         assert 0.9 < float(bodies.volume.sum()) / 0.2**3 < 1.15  # the Gaussians are half a voxel thick
 
 
+@pytest.mark.parametrize(("spacing", "count"), [(0.012, 2000), (0.02, 20_000)])
+def test_a_rod_whose_gaussians_are_sparse_is_filled(spacing, count):
+    """.3 x .05 x .05, with gaps of many voxels between its Gaussians; a body of separate points would have a tenth."""
+    surface = box((0.3, 0.05, 0.05), spacing)
+    g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
+    bodies = sample_bodies(Scene(g, (SceneObject(1, "rod"),)), count)
+    assert 0.6 < float(bodies.volume.sum()) / (0.3 * 0.05**2) < 1.1
+
+
+def test_an_object_on_the_floor_is_as_full_as_one_above_it():
+    """A ball with a hole in its side, wider than closing by the floor allows for."""
+    points = sphere(20_000)
+    holed = points[(points - torch.tensor([0.1, 0.0, 0.0])).norm(dim=1) > 0.02] + torch.tensor([0.0, 0.0, 0.1])
+    full = [float(sample_bodies(scene(splats(holed), floor=z), 20_000).volume.sum()) for z in (0.0, -1.0)]
+    assert full[0] == pytest.approx(full[1], rel=0.05) and full[1] > 0.9 * 4 / 3 * math.pi * 1e-3
+
+
 def test_a_box_has_no_rods_along_its_edges():
     """Voxels that trimming left there were thickened like sheets, and held other objects at a distance."""
     surface = box((0.2, 0.2, 0.2), 0.2 / 24)

@@ -45,7 +45,7 @@ class PlausibilityMonitor:
         self._rows = [(keypoints.object_id == o.id).nonzero()[:, 0] for o in scene.objects]
         self._rest = [keypoints.rest[rows].double().numpy() for rows in self._rows]
         self._few = [slice(None, None, -(-max(len(r), 1) // MAX_CHECKED_KEYPOINTS)) for r in self._rest]
-        self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest])
+        self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._floor = options.floor if options.floor is not None else scene.floor
         self._table = table_of(scene, options) if options.engine == "rigid" else None

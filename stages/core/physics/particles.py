@@ -42,6 +42,11 @@ MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gau
 START = 0.25  # of the object's bounds in their voxel
 CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
+STRAY = 0.01  # fraction of an object's points that may be below it
+ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
+BOTTOMS = (0.0, 0.02, 0.1, 0.3)  # quantiles of the heights of points at which an unseen underside may begin
+FULLER = 1.5  # ratio of volumes above which it does: then it makes a body of a shell
+BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 
 
@@ -162,7 +167,8 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
-    body, low, _ = _closed_body(points - (first - h / 2), h, gap, _stands(points, h, scene.floor), photographed=False)
+    floor = scene.floor - (first - h / 2)[2] if _stands(points, h, scene.floor) else None
+    body, low = _closed_body(points - (first - h / 2), h, gap, floor, photographed=scene.cameras is not None)
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
@@ -170,9 +176,16 @@ def _solid(
     points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool, skin: bool
 ) -> tuple[np.ndarray, float, bool]:
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
-    of volume that each represents; the last value as in _closed_body.
+    of volume that each represents; and whether it was extended down to the floor, as one that would tip over although
+    it stood when `photographed`.
     """
-    body, low, extended = _closed_body(points, h, gap, _stands(points, h, floor), photographed)
+    stands = _stands(points, h, floor)
+    body, low = _closed_body(points, h, gap, floor if stands else None, photographed)
+    extended = photographed and stands and _topples(body)
+    if extended:
+        bottom = int(body.any((0, 1)).argmax())
+        body = np.logical_or.accumulate(body[:, :, ::-1], 2)[:, :, ::-1]  # all voxels below it
+        body[:, :, :bottom] = False
     inside = body if skin else body & ~_thick_skin(body)
     if inside.sum() < MIN_PARTICLES:
         inside = body
@@ -180,17 +193,24 @@ def _solid(
 
 
 def _stands(points: np.ndarray, h: float, floor: float | None) -> bool:
-    """Whether an object with these points ends within four voxels of edge h of the floor."""
-    return floor is not None and abs(math.floor(float(points[:, 2].min()) / h) - floor / h) < 4
+    """Whether an object with these points, without stray ones, ends within ON_FLOOR voxels of edge h of the floor."""
+    return floor is not None and abs(float(np.quantile(points[:, 2], STRAY)) - floor) < ON_FLOOR * h
+
+
+def _topples(body: np.ndarray) -> bool:
+    """Whether a body of voxels would tip over."""
+    at = torch.from_numpy(np.argwhere(body)).float()
+    return topples(at[:, :2], at[at[:, 2] < float(np.quantile(at[:, 2].numpy(), BASE)) + ON_FLOOR, :2])
 
 
 def _closed_body(
-    points: np.ndarray, h: float, gap: float, standing: bool, photographed: bool
-) -> tuple[np.ndarray, np.ndarray, bool]:
+    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
-    A `standing` one is closed by the floor. One that would tip over although it stood when `photographed`
-    is extended down to the floor; the last value is whether it was.
+    It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
+    no undersides of what is at rest, and only parts of the surface around them. So `photographed` ones are also closed
+    where that becomes sparse, whatever they lie on, if it makes a body of a shell.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
@@ -204,15 +224,23 @@ def _closed_body(
     shell = np.zeros(shape, bool)
     shell.ravel()[at] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    # closed by the floor where it stands, or with wider leaks as what hangs is: what fills more
-    filled = (_largest(_fill(shell, bridge, way)) for way in ((True, False) if standing else (False,)))
-    body = max((_trim(b, points / h - low - cells - 0.5, at) for b in filled), key=np.count_nonzero)
-    at = torch.from_numpy(np.argwhere(body)).float()
-    extended = photographed and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
-    if extended:
-        bottom = int(np.flatnonzero(body.any((0, 1)))[0])
-        body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # all voxels below the body
-        body[:, :, :bottom] = False
+    offset = points / h - low - cells - 0.5
+
+    def filled(bottom: int | None, leaks: Sequence[int], sealed: bool = False) -> np.ndarray:
+        return _trim(_largest(_fill(shell, bridge, bottom, leaks, sealed)), offset, at)
+
+    body = filled(None, LEAK_RADII)
+    lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
+    if floor is not None:
+        # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide leaks
+        body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
+    most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
+    for q in BOTTOMS if photographed else ():
+        if most <= FULLER * body.sum():
+            break
+        other = filled(max(lowest, int(np.quantile(cells[:, 2], q))), LEAK_RADII, sealed=True)
+        if other.sum() > FULLER * body.sum():
+            body = other
     thick = opened(body)
     thin = body & ~thick
     fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet
@@ -222,7 +250,7 @@ def _closed_body(
     while body.sum() < MIN_PARTICLES:
         body = dilated(np.pad(body, 1))
         low = low - 1
-    return body, low, extended
+    return body, low
 
 
 @cached_in_scene
@@ -248,23 +276,22 @@ def _gap(points: np.ndarray) -> float:
     return float(distance[:, 3].quantile(0.9))
 
 
-def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
-    """The shell with gaps closed and the enclosed volume filled; the floor closes the bottom of standing objects."""
+def _fill(shell: np.ndarray, gap: int, bottom: int | None, leaks: Sequence[int], sealed: bool) -> np.ndarray:
+    """The shell with gaps closed and the enclosed volume filled. `bottom` is the layer that closes it from below, also
+    against wide leaks if it is `sealed`; `leaks` as for _cavities.
+    """
     wide = within(shell, gap)
-    layers = np.flatnonzero(shell.any((0, 1)))
-    sealed = wide.copy()
-    if standing:
-        sealed[:, :, : layers[0] + 1] = True
-    outside = _outside(~sealed)
-    enclosed = ~(outside | sealed)
+    walls = wide.copy()
+    if bottom is not None:
+        walls[:, :, : bottom + 1] = True
+    outside = _outside(~walls)
+    enclosed = ~(outside | walls)
     grown = within(enclosed, gap) & wide if enclosed.any() else enclosed
     closed = ~within(~wide, gap)
     body = shell | closed | enclosed | (grown & ~within(outside, gap))
-    if not standing:
-        return body | _cavities(body, LEAK_RADII)
-    # gaps that closing just misses leak too, but a cloth on the floor has folds that look like cavities with wide leaks
-    body |= _cavities(body, (gap + 1,))
-    body[:, :, : layers[0]] = False
+    body |= _cavities(body | (walls & ~wide) if sealed else body, leaks)
+    if bottom is not None:
+        body[:, :, : int(shell.any((0, 1)).argmax())] = False
     return body
 
 

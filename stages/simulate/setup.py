@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -177,9 +178,21 @@ def table_of(scene: Scene, options: SimulateOptions) -> TableOutline | None:
 
 def from_photos(scene: Scene) -> bool:
     """Whether `ngff reconstruct` is among the commands that made a scene."""
-    provenance = scene.provenance
+    return "reconstruct" in _commands(scene)
+
+
+def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
+    """Log that a scene of photos has no unseen sides, if none were added."""
+    commands = _commands(scene)
+    if "reconstruct" in commands and "refine" not in commands:
+        log.info("%s: the sides that no photo shows are missing, so that objects may be too light and hollow; "
+                 "`ngff refine` adds them", path)  # fmt: skip
+
+
+def _commands(scene: Scene) -> set[str]:
+    """The commands that made a scene."""
+    found, provenance = set(), scene.provenance
     while isinstance(provenance, dict):
-        if provenance.get("command") == "reconstruct":
-            return True
+        found.add(provenance.get("command"))
         provenance = provenance.get("scene")
-    return False
+    return found

@@ -24,6 +24,7 @@ from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 from stages.simulate.engine_choice import for_engine, with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.plausibility import PlausibilityMonitor
+from stages.simulate.setup import tell_of_unseen_sides
 
 log = logging.getLogger(__name__)
 MIN_EXTENT = 1e-5  # of an object, relative to its coordinates, which have 24 bits
@@ -42,6 +43,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     pick_device(options.device)  # a wrong name is an error with every engine
     check_output(Path(out))
     world = with_objects(read_scene(scene), scene, options.device)
+    tell_of_unseen_sides(world, Path(scene))
     stored = forces.ForcePrompts()
     if options.forces is not None:
         stored = read_prompts_file(options.forces, Path(scene).stem, world.objects)

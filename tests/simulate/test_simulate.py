@@ -26,7 +26,7 @@ from stages.simulate import moving_grid
 from stages.simulate import mpm as engine
 from stages.simulate.mpm import _stable_material
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
-from stages.simulate.setup import MIN_ROOM, _default_box, set_up_scene
+from stages.simulate.setup import MIN_ROOM, _default_box, set_up_scene, tell_of_unseen_sides
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 from tests.segment.tabletop import three_apart
@@ -99,6 +99,19 @@ def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(file, caplog):
 def test_same_seed_gives_the_same_bytes(file, device):
     first, second = (command(file, steps=4, device=device).positions for _ in range(2))
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize(("commands", "told"), [
+    (("reconstruct",), True), (("segment", "reconstruct"), True), (("refine", "segment", "reconstruct"), False),
+    ((), False), (("segment",), False),
+])  # fmt: skip
+def test_scenes_of_photos_that_were_not_refined_are_told_of(balls, tmp_path, caplog, commands, told):
+    caplog.set_level(logging.INFO)
+    made: dict = {}
+    for command_name in reversed(commands):
+        made = {"command": command_name, "scene": made}
+    tell_of_unseen_sides(replace(balls, provenance=made), tmp_path / "scene.ply")
+    assert ("`ngff refine` adds them" in caplog.text) == told
 
 
 def test_scene_units_other_than_metres(balls, caplog):

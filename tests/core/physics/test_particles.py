@@ -128,6 +128,30 @@ def test_a_rod_whose_gaussians_are_sparse_is_filled(spacing, count):
     assert 0.6 < float(bodies.volume.sum()) / (0.3 * 0.05**2) < 1.1
 
 
+@pytest.mark.parametrize("height", [0.0, 0.2])
+def test_a_photographed_box_without_an_underside_is_filled_from_below(height):
+    """Its walls end between 0 and .02 above what it lies on, be that the floor or not, and two points are below it."""
+    surface = box((0.2, 0.15, 0.1), 0.004).moved((0.0, 0.0, 0.05))
+    p = surface.points
+    ragged = 0.01 + 0.01 * torch.sin(40 * p[:, 0] + 70 * p[:, 1])
+    stray = torch.tensor([[0.1, 0.0, -0.03], [-0.1, 0.0, -0.025]])
+    seen = splats(torch.cat([p[p[:, 2] > ragged], stray]) + torch.tensor([0.0, 0.0, height]))
+    photographed, alone = (replace(scene(seen, floor=0.0), cameras=c) for c in (ring(), None))
+    for count in (5000, 40_000):
+        assert float(sample_bodies(photographed, count).volume.sum()) == pytest.approx(0.003, rel=0.15)
+    assert float(sample_bodies(alone, 40_000).volume.sum()) < 0.5 * 0.003 or height == 0.0
+    voxels, h = filled_voxels(photographed, 1, 48)
+    assert len(voxels) * h**3 == pytest.approx(0.003, rel=0.15)
+
+
+def test_an_open_bowl_of_photos_stays_hollow():
+    points = sphere(20_000)
+    bowl = splats(points[points[:, 2] < 0.02] + torch.tensor([0.0, 0.0, 0.1]))
+    volume = [float(sample_bodies(replace(scene(bowl, floor=0.0), cameras=c), 20_000).volume.sum())
+              for c in (ring(), None)]  # fmt: skip
+    assert volume[0] == volume[1] < 0.5 * 2 / 3 * math.pi * 1e-3
+
+
 def test_an_object_on_the_floor_is_as_full_as_one_above_it():
     """A ball with a hole in its side, wider than closing by the floor allows for."""
     points = sphere(20_000)

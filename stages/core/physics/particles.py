@@ -44,8 +44,8 @@ CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagon
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
 STRAY = 0.01  # fraction of an object's points that may be below it
 ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
-BOTTOMS = (0.02, 0.1, 0.3)  # quantiles of the heights of points at which an unseen underside may begin
-FULLER = 1.5  # ratio of volumes above which it does: then it makes a body of a shell
+UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
+FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
 BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 
@@ -224,10 +224,10 @@ def _closed_body(
     shell = np.zeros(shape, bool)
     shell.ravel()[at] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    offset = points / h - low - cells - 0.5
+    wide, offset = within(shell, bridge), points / h - low - cells - 0.5
 
     def filled(bottom: int | None, leaks: Sequence[int], sealed: bool = False) -> np.ndarray:
-        return _trim(_largest(_fill(shell, bridge, bottom, leaks, sealed)), offset, at)
+        return _trim(_largest(_fill(shell, wide, bridge, bottom, leaks, sealed)), offset, at)
 
     body = filled(None, LEAK_RADII)
     lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
@@ -235,12 +235,10 @@ def _closed_body(
         # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide leaks
         body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
     most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
-    for q in BOTTOMS if photographed else ():
-        if most <= FULLER * body.sum():
-            break
-        other = filled(max(lowest, int(np.quantile(cells[:, 2], q))), LEAK_RADII, sealed=True)
-        if other.sum() > FULLER * body.sum():
-            body = other
+    if photographed and most > FULLER * body.sum():
+        below = max(lowest, int(np.quantile(cells[:, 2], UNDERSIDE)))
+        other = filled(below, LEAK_RADII, sealed=True)
+        body = other if other.sum() > FULLER * body.sum() else body
     thick = opened(body)
     thin = body & ~thick
     fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet
@@ -276,11 +274,13 @@ def _gap(points: np.ndarray) -> float:
     return float(distance[:, 3].quantile(0.9))
 
 
-def _fill(shell: np.ndarray, gap: int, bottom: int | None, leaks: Sequence[int], sealed: bool) -> np.ndarray:
-    """The shell with gaps closed and the enclosed volume filled. `bottom` is the layer that closes it from below, also
-    against wide leaks if it is `sealed`; `leaks` as for _cavities.
+def _fill(
+    shell: np.ndarray, wide: np.ndarray, gap: int, bottom: int | None, leaks: Sequence[int], sealed: bool
+) -> np.ndarray:
+    """The shell with gaps closed and the enclosed volume filled; `wide` is within `gap` of it.
+
+    `bottom` is the layer that closes it from below, against wide leaks too if it is `sealed`; `leaks` as for _cavities.
     """
-    wide = within(shell, gap)
     walls = wide.copy()
     if bottom is not None:
         walls[:, :, : bottom + 1] = True

@@ -391,5 +391,5 @@ def test_a_cube_sampled_at_every_third_voxel_is_filled():
     every[6:25:3] = True
     cube = side[:, None, None] & side[:, None] & side
     shell = cube & ~ndimage.binary_erosion(cube) & (every[:, None, None] & every[:, None] & every)
-    body = particles._fill(shell, 3, None, particles.LEAK_RADII, sealed=False)
+    body = particles._fill(shell, particles.within(shell, 3), 3, None, particles.LEAK_RADII, sealed=False)
     assert body[ndimage.binary_erosion(cube)].all() and not body[~cube].any()

@@ -42,7 +42,7 @@ MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gau
 START = 0.25  # of the object's bounds in their voxel
 CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
-STRAY = 0.01  # fraction of an object's points that may be below it
+STRAY = 0.01  # fraction of an object's points that may be below it, and of voxels in which others may be
 ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
 UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
 FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
@@ -70,14 +70,14 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     Raises InputError for an object without any usable Gaussian.
     """
     clouds, gaps = zip(*parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects), strict=True)
-    photographed = scene.cameras is not None  # so the objects were at rest
+    others = [_others(scene, o.id) for o in scene.objects]
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        rows = list(zip(clouds, gaps, strict=True))
-        solids = parallel_map(lambda row, h=h: _solid(row[0], h, row[1], scene.floor, photographed, skin), rows)
+        rows = list(zip(clouds, gaps, others, strict=True))
+        solids = parallel_map(lambda row, h=h: _solid(row[0], h, *row[1:], scene.floor, skin), rows)
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
@@ -167,21 +167,22 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     spacing = _spacing(usable_means(scene, object_id).double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
-    floor = scene.floor - (first - h / 2)[2] if _stands(points, h, scene.floor) else None
-    body, low = _closed_body(points - (first - h / 2), h, gap, floor, photographed=scene.cameras is not None)
+    origin = first - h / 2
+    floor = scene.floor - origin[2] if _stands(points, h, scene.floor) else None
+    body, low = _closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin))
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
 def _solid(
-    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool, skin: bool
+    points: np.ndarray, h: float, gap: float, others: np.ndarray | None, floor: float | None, skin: bool
 ) -> tuple[np.ndarray, float, bool]:
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
     of volume that each represents; and whether it was extended down to the floor, as one that would tip over although
-    it stood when `photographed`.
+    it stood in photos.
     """
     stands = _stands(points, h, floor)
-    body, low = _closed_body(points, h, gap, floor if stands else None, photographed)
-    extended = photographed and stands and _topples(body)
+    body, low = _closed_body(points, h, gap, floor if stands else None, others)
+    extended = others is not None and stands and _topples(body)
     if extended:
         bottom = int(body.any((0, 1)).argmax())
         body = np.logical_or.accumulate(body[:, :, ::-1], 2)[:, :, ::-1]  # all voxels below it
@@ -190,6 +191,14 @@ def _solid(
     if inside.sum() < MIN_PARTICLES:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
+
+
+def _others(scene: Scene, object_id: int, origin: np.ndarray | float = 0.0) -> np.ndarray | None:
+    """Centres (k, 3) of the Gaussians of the other objects of a photographed scene, from `origin`."""
+    if scene.cameras is None:
+        return None
+    means = [usable_means(scene, o.id) for o in scene.objects if o.id != object_id]
+    return torch.cat([*means, torch.empty(0, 3)]).double().numpy() - origin
 
 
 def _stands(points: np.ndarray, h: float, floor: float | None) -> bool:
@@ -204,13 +213,14 @@ def _topples(body: np.ndarray) -> bool:
 
 
 def _closed_body(
-    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
+    points: np.ndarray, h: float, gap: float, floor: float | None, others: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
     It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
-    no undersides of what is at rest, and only parts of the surface around them. So `photographed` ones are also closed
-    where that becomes sparse, whatever they lie on, if it makes a body of a shell.
+    no undersides of what is at rest, and only parts of the surface around them. So photographed ones, those with points
+    of `others` (k, 3), are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell
+    and the others are not inside.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
@@ -235,10 +245,15 @@ def _closed_body(
         # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide leaks
         body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
     most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
-    if photographed and most > FULLER * body.sum():
+    if others is not None and most > FULLER * body.sum():
         below = max(lowest, int(np.quantile(cells[:, 2], UNDERSIDE)))
         other = filled(below, LEAK_RADII, sealed=True)
-        body = other if other.sum() > FULLER * body.sum() else body
+        theirs = np.floor(others / h).astype(np.int64) - low
+        theirs = np.unique(theirs[((theirs >= 0) & (theirs < shape)).all(1)], axis=0)
+        added = other & ~body
+        inside = np.count_nonzero(added[tuple(theirs.T)]) > STRAY * added.sum()
+        if other.sum() > FULLER * body.sum() and not inside:
+            body = other
     thick = opened(body)
     thin = body & ~thick
     fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet

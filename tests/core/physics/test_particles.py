@@ -144,6 +144,19 @@ def test_a_photographed_box_without_an_underside_is_filled_from_below(height):
     assert len(voxels) * h**3 == pytest.approx(0.003, rel=0.15)
 
 
+def test_what_covers_another_object_in_photos_is_not_closed_around_it():
+    """Half a sphere over a cube, both without undersides: as if it were alone it would be filled."""
+    points = sphere(20_000)
+    cover = splats(points[points[:, 2] > 0.0])
+    inner = splats(box((0.06,) * 3, 0.004).points + torch.tensor([0.0, 0.0, 0.03]), 2)
+    solid = 2 / 3 * math.pi * 1e-3
+    alone, covering = (replace(scene(*bodies, floor=-1.0), cameras=ring()) for bodies in ((cover,), (cover, inner)))
+    assert float(sample_bodies(alone, 20_000).volume.sum()) == pytest.approx(solid, rel=0.1)
+    both = sample_bodies(covering, 20_000)
+    volume = [float(both.volume[both.body == k].sum()) for k in (0, 1)]
+    assert volume[0] < 0.5 * solid and volume[1] == pytest.approx(0.06**3, rel=0.2)
+
+
 def test_an_open_bowl_of_photos_stays_hollow():
     points = sphere(20_000)
     bowl = splats(points[points[:, 2] < 0.02] + torch.tensor([0.0, 0.0, 0.1]))

@@ -178,21 +178,11 @@ def table_of(scene: Scene, options: SimulateOptions) -> TableOutline | None:
 
 def from_photos(scene: Scene) -> bool:
     """Whether `ngff reconstruct` is among the commands that made a scene."""
-    return "reconstruct" in _commands(scene)
+    return "reconstruct" in scene.commands
 
 
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
     """Log that a scene of photos has no unseen sides, if none were added."""
-    commands = _commands(scene)
-    if "reconstruct" in commands and "refine" not in commands:
+    if from_photos(scene) and "refine" not in scene.commands:
         log.info("%s: the sides that no photo shows are missing, so that objects may be too light and hollow; "
                  "`ngff refine` adds them", path)  # fmt: skip
-
-
-def _commands(scene: Scene) -> set[str]:
-    """The commands that made a scene."""
-    found, provenance = set(), scene.provenance
-    while isinstance(provenance, dict):
-        found.add(provenance.get("command"))
-        provenance = provenance.get("scene")
-    return found

@@ -71,13 +71,14 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     """
     clouds, gaps = zip(*parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects), strict=True)
     others = [_others(scene, o.id) for o in scene.objects]
+    photographed = scene.cameras is not None  # so the objects were at rest
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
         rows = list(zip(clouds, gaps, others, strict=True))
-        solids = parallel_map(lambda row, h=h: _solid(row[0], h, *row[1:], scene.floor, skin), rows)
+        solids = parallel_map(lambda row, h=h: _solid(row[0], h, *row[1:], scene.floor, photographed, skin), rows)
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
@@ -174,15 +175,16 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
 
 
 def _solid(
-    points: np.ndarray, h: float, gap: float, others: np.ndarray | None, floor: float | None, skin: bool
-) -> tuple[np.ndarray, float, bool]:
+    points: np.ndarray, h: float, gap: float, others: np.ndarray | None, floor: float | None, photographed: bool,
+    skin: bool,
+) -> tuple[np.ndarray, float, bool]:  # fmt: skip
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
     of volume that each represents; and whether it was extended down to the floor, as one that would tip over although
-    it stood in photos.
+    it stood when `photographed`.
     """
     stands = _stands(points, h, floor)
     body, low = _closed_body(points, h, gap, floor if stands else None, others)
-    extended = others is not None and stands and _topples(body)
+    extended = photographed and stands and _topples(body)
     if extended:
         bottom = int(body.any((0, 1)).argmax())
         body = np.logical_or.accumulate(body[:, :, ::-1], 2)[:, :, ::-1]  # all voxels below it
@@ -194,8 +196,8 @@ def _solid(
 
 
 def _others(scene: Scene, object_id: int, origin: np.ndarray | float = 0.0) -> np.ndarray | None:
-    """Centres (k, 3) of the Gaussians of the other objects of a photographed scene, from `origin`."""
-    if scene.cameras is None:
+    """Centres (k, 3) of the Gaussians of the other objects of a scene whose unseen sides are missing, from `origin`."""
+    if scene.cameras is None or "refine" in scene.commands:
         return None
     means = [usable_means(scene, o.id) for o in scene.objects if o.id != object_id]
     return torch.cat([*means, torch.empty(0, 3)]).double().numpy() - origin
@@ -218,9 +220,9 @@ def _closed_body(
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
     It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
-    no undersides of what is at rest, and only parts of the surface around them. So photographed ones, those with points
-    of `others` (k, 3), are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell
-    and the others are not inside.
+    no undersides of what is at rest, and only parts of the surface around them. So those with points of `others` (k, 3)
+    are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are
+    not inside.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing

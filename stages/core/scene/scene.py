@@ -46,6 +46,15 @@ class Scene:
         """Whether `metres_per_unit` was measured or given; otherwise a unit is only taken as 1 m."""
         return not str(self.scale.get("source", "not stated")).startswith(UNKNOWN_SCALE)
 
+    @property
+    def commands(self) -> set[str]:
+        """The commands that made it, such as "reconstruct" and "refine"."""
+        found, made = set(), self.provenance
+        while isinstance(made, dict):
+            found.add(str(made.get("command", "")))
+            made = made.get("scene")
+        return found - {""}
+
     def mass_text(self, mass: float) -> str:
         """A mass [kg] for messages; it holds for a unit of 1 m where the scale is not known."""
         return f"{mass:.3g} kg" + ("" if self.has_known_scale else " if one unit is 1 m")

@@ -100,6 +100,14 @@ def simulate(
         str,
         Option(help="engine ngff: learned, for soft bodies | solved, with the materials' friction and rebound | auto"),
     ] = SimulateOptions.contact,
+    rest: Annotated[
+        bool,
+        Option(
+            "--rest/--no-rest",
+            help="hold objects of photos until something acts on them, or let them fall from where they are, "
+            "as in photos of a moment",
+        ),
+    ] = SimulateOptions.rest,
     live: Annotated[
         bool,
         Option(
@@ -120,8 +128,8 @@ def simulate(
         steps=steps, dt=dt, engine=engine, gravity=gravity, quality=quality, material=tuple(material or ()),
         materials=materials, force=tuple(force or ()), forces=forces, pin=tuple(pin or ()),
         velocity=tuple(velocity or ()), lift=tuple(lift or ()), floor=floor, friction=friction, box=box,
-        keypoints=keypoints, weights=weights, integrator=integrator, contact=contact, live=live, browser=browser,
-        port=port, seed=seed, device=device,
+        keypoints=keypoints, weights=weights, integrator=integrator, contact=contact, rest=rest, live=live,
+        browser=browser, port=port, seed=seed, device=device,
     )  # fmt: skip
     load("stages.simulate.stage:run")(scene, out, options)
 

@@ -78,6 +78,7 @@ class SimulateOptions:
     weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
     integrator: str = "step"  # of a learned engine, one of INTEGRATORS
     contact: str = AUTO  # of the engine ngff, one of CONTACTS; AUTO: see engine_choice.py
+    rest: bool = True  # hold objects of photos until something acts on them
     live: bool = False  # in real time, with a page in the browser to act on the objects
     browser: bool = True  # whether --live opens it
     port: int = 0  # of --live on 127.0.0.1; 0: any free one

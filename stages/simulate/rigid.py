@@ -50,7 +50,15 @@ from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
 from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
-from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene, table_of
+from stages.simulate.setup import (
+    SceneSetup,
+    check_motion,
+    choose_for_bodies,
+    from_photos,
+    held_as_seen,
+    set_up_scene,
+    table_of,
+)
 from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
 from stages.simulate.table_edges import TableEdges
 
@@ -226,7 +234,7 @@ class _World:
 
     def _at_rest(self, scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[int]:
         """Rows of the objects that are at rest in photos and that no prompt moves at the start."""
-        if not from_photos(scene) or options.gravity <= 0:
+        if not held_as_seen(scene, options) or options.gravity <= 0:
             return []
         return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
 

@@ -181,6 +181,11 @@ def from_photos(scene: Scene) -> bool:
     return "reconstruct" in scene.commands
 
 
+def held_as_seen(scene: Scene, options: SimulateOptions) -> bool:
+    """Whether objects are at rest where photos show them; not those of films, which begin as they are released."""
+    return options.rest and from_photos(scene) and scene.sequence is None
+
+
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
     """Log that a scene of photos has no unseen sides, if none were added."""
     if from_photos(scene) and "refine" not in scene.commands:

@@ -12,11 +12,18 @@ def roll(*surfaces, photos=True, **options) -> Motion:
     scene = scene_of(surfaces, photos=photos)
     material = tuple(f"{o.id}=wood" for o in scene.objects)
     chosen = {"engine": "ngff", "contact": "solved", "keypoints": 32, "quality": "draft", "material": material}
-    return roll_out(scene, SimulateOptions(**chosen, **options))
+    return roll_out(scene, SimulateOptions(**{**chosen, **options}))
 
 
 def moved(t: Motion, row: int) -> torch.Tensor:
     return t.com[-1, row] - t.com[0, row]
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("contact", ["solved", "learned"])
+def test_with_no_rest_what_hangs_in_the_air_falls(contact):
+    t = roll(cube(0.1, 0, 0.15), steps=7, rest=False, contact=contact)
+    assert float(moved(t, 0)[2]) == pytest.approx(-9.81 * 0.12**2 / 2, rel=0.1)
 
 
 @pytest.mark.usefixtures("device")

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from stages.core.physics import solid_surface
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
@@ -175,6 +177,16 @@ def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
     assert abs(float(t.com[-1, 0, 2] - t.com[0, 0, 2]) + 0.15) < 0.01
     hit = roll(tmp_path, *cubes, steps=40, photos=True, velocity=("object=3 4,0,0",))
     assert float(hit.com[-1, 0, 2] - hit.com[0, 0, 2]) < -0.1
+
+
+def test_objects_of_films_and_with_no_rest_fall_from_where_they_are(tmp_path):
+    """By half of .15, in .124 s, or the rest until the floor."""
+    hanging = cube(0.1, 0, 0.15)
+    still, free = (roll(tmp_path, hanging, steps=7, photos=True, rest=rest) for rest in (True, False))
+    assert torch.equal(still.positions[-1], still.positions[0])
+    scene = replace(scene_of((hanging,), photos=True), sequence=FilmedSequence(50.0, 60, {"a": 3.0}))
+    for t in (free, roll_out(scene, options_of(scene, tmp_path, steps=7))):
+        assert float(t.com[-1, 0, 2] - t.com[0, 0, 2]) == pytest.approx(-G * 0.12**2 / 2, rel=0.05)
 
 
 @pytest.mark.parametrize(("speed", "moves"), [(0.05, False), (1.0, True)])

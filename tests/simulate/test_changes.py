@@ -68,7 +68,7 @@ def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
 
 def test_what_rests_in_photos_moves_when_its_material_or_gravity_changes(apart, monkeypatch):
     """What holds the balls is not seen. Ball 1 gets another material at .04 s, which has it fall; later both fall."""
-    monkeypatch.setattr(rigid, "from_photos", lambda scene: True)
+    monkeypatch.setattr(rigid, "held_as_seen", lambda scene, options: True)
     changes = Change("material", "rubber", 0.04, 1), Change("gravity", 5.0, 0.1)
     z = torch.stack([s.com[:, 2] for s in frames(apart, ForcePrompts(changes=changes), engine="rigid", steps=9)])
     fallen = (z < z[0] - 1e-4).T.tolist()

@@ -12,14 +12,11 @@ are in the unit of the Gaussians.
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy import ndimage
 from torch import Tensor
 
 from stages.core.errors import InputError
@@ -27,7 +24,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
-from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
+from stages.core.physics.body_filling import MAX_VOXELS_ALONG, MIN_PARTICLES, STRAY, closed_body, thick_skin
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -36,18 +33,11 @@ log = logging.getLogger(__name__)
 
 MIN_PARTICLE_OPACITY = 0.02  # Gaussians of lower opacity are ignored, as published
 MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
-MIN_PARTICLES = 40  # per object
-MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
 START = 0.25  # of the object's bounds in their voxel
 CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
-LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
-STRAY = 0.01  # fraction of an object's points that may be below it, and of voxels in which others may be
 ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
-UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
-FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
 BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
-MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 
 
 @dataclass(frozen=True)
@@ -170,7 +160,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
     origin = first - h / 2
     floor = scene.floor - origin[2] if _stands(points, h, scene.floor) else None
-    body, low = _closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin))
+    body, low = closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin))
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
@@ -183,13 +173,13 @@ def _solid(
     it stood when `photographed`.
     """
     stands = _stands(points, h, floor)
-    body, low = _closed_body(points, h, gap, floor if stands else None, others)
+    body, low = closed_body(points, h, gap, floor if stands else None, others)
     extended = photographed and stands and _topples(body)
     if extended:
         bottom = int(body.any((0, 1)).argmax())
         body = np.logical_or.accumulate(body[:, :, ::-1], 2)[:, :, ::-1]  # all voxels below it
         body[:, :, :bottom] = False
-    inside = body if skin else body & ~_thick_skin(body)
+    inside = body if skin else body & ~thick_skin(body)
     if inside.sum() < MIN_PARTICLES:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
@@ -214,60 +204,6 @@ def _topples(body: np.ndarray) -> bool:
     return topples(at[:, :2], at[at[:, 2] < float(np.quantile(at[:, 2].numpy(), BASE)) + ON_FLOOR, :2])
 
 
-def _closed_body(
-    points: np.ndarray, h: float, gap: float, floor: float | None, others: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
-
-    It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
-    no undersides of what is at rest, and only parts of the surface around them. So those with points of `others` (k, 3)
-    are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are
-    not inside.
-    """
-    cells = np.floor(points / h).astype(np.int64)
-    margin = 6  # room for closing
-    low = cells.min(0) - margin
-    shape = np.minimum(cells.max(0) - low + 1 + margin, MAX_VOXELS_ALONG + 3 * margin)
-    cells -= low
-    kept = (cells < shape - margin).all(1)
-    if not kept.all():
-        points, cells = points[kept], cells[kept]
-    at = np.ravel_multi_index(tuple(cells.T), shape)
-    shell = np.zeros(shape, bool)
-    shell.ravel()[at] = True
-    bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    wide, offset = within(shell, bridge), points / h - low - cells - 0.5
-
-    def filled(bottom: int | None, leaks: Sequence[int], sealed: bool = False) -> np.ndarray:
-        return _trim(_largest(_fill(shell, wide, bridge, bottom, leaks, sealed)), offset, at)
-
-    body = filled(None, LEAK_RADII)
-    lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
-    if floor is not None:
-        # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide leaks
-        body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
-    most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
-    if others is not None and most > FULLER * body.sum():
-        below = max(lowest, int(np.quantile(cells[:, 2], UNDERSIDE)))
-        other = filled(below, LEAK_RADII, sealed=True)
-        theirs = np.floor(others / h).astype(np.int64) - low
-        theirs = np.unique(theirs[((theirs >= 0) & (theirs < shape)).all(1)], axis=0)
-        added = other & ~body
-        inside = np.count_nonzero(added[tuple(theirs.T)]) > STRAY * added.sum()
-        if other.sum() > FULLER * body.sum() and not inside:
-            body = other
-    thick = opened(body)
-    thin = body & ~thick
-    fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet
-    body, thin = body & ~fringe, thin & ~fringe
-    if thin.any():
-        body |= dilated(thin)
-    while body.sum() < MIN_PARTICLES:
-        body = dilated(np.pad(body, 1))
-        low = low - 1
-    return body, low
-
-
 @cached_in_scene
 def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float]:
     """`surface_points` of an object, and the gap between them that is closed."""
@@ -289,102 +225,6 @@ def _gap(points: np.ndarray) -> float:
     some = torch.from_numpy(points)
     distance, _ = knn(some, some[:: max(1, len(some) // 1000)], 4)
     return float(distance[:, 3].quantile(0.9))
-
-
-def _fill(
-    shell: np.ndarray, wide: np.ndarray, gap: int, bottom: int | None, leaks: Sequence[int], sealed: bool
-) -> np.ndarray:
-    """The shell with gaps closed and the enclosed volume filled; `wide` is within `gap` of it.
-
-    `bottom` is the layer that closes it from below, against wide leaks too if it is `sealed`; `leaks` as for _cavities.
-    """
-    walls = wide.copy()
-    if bottom is not None:
-        walls[:, :, : bottom + 1] = True
-    outside = _outside(~walls)
-    enclosed = ~(outside | walls)
-    grown = within(enclosed, gap) & wide if enclosed.any() else enclosed
-    closed = ~within(~wide, gap)
-    body = shell | closed | enclosed | (grown & ~within(outside, gap))
-    body |= _cavities(body | (walls & ~wide) if sealed else body, leaks)
-    if bottom is not None:
-        body[:, :, : int(shell.any((0, 1)).argmax())] = False
-    return body
-
-
-def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
-    """Cavities with leaks narrower than the cavity by MIN_CAVITY_RATIO: a jug is filled, a mug or a bowl is not.
-
-    Reconstructed shells have holes; left hollow, they would crumple like paper bags. `leaks` are the half widths of the
-    holes to close [voxels], increasing.
-    """
-    if not walls.any():
-        return walls
-    box = ndimage.find_objects(walls.view(np.uint8))[0]  # what is free on its faces is so further out too
-    inner = walls[box]
-    away = squared_distances(inner, math.ceil(MIN_CAVITY_RATIO * leaks[-1]))
-    filled = np.zeros_like(inner)
-    for leak in leaks:
-        free, wide = away > leak**2, away >= (MIN_CAVITY_RATIO * leak) ** 2
-        hollow = free & ~_outside(free) & ~filled
-        if (hollow & wide).any():
-            hollow = _components_with(hollow, wide)
-            room = leak + 1  # margin, beyond which all is free
-            outside = _outside(squared_distances(np.pad(inner, room), leak) > leak**2)
-            from_outside = squared_distances(outside, room)[room:-room, room:-room, room:-room]
-            filled |= _components_with(~inner & (from_outside > room**2), hollow)  # to the walls, not through the leaks
-    out = np.zeros_like(walls)
-    out[box] = filled
-    return out
-
-
-def _components_with(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The connected components of the free voxels that contain a seed."""
-    labels, count = ndimage.label(free)
-    kept = np.zeros(count + 1, bool)
-    kept[labels[free & seeds]] = True
-    return kept[labels]
-
-
-def _outside(free: np.ndarray) -> np.ndarray:
-    """The free voxels connected to the faces of the grid."""
-    labels, count = ndimage.label(free)
-    kept = np.zeros(count + 1, bool)
-    for axis in range(3):
-        for end in (0, -1):
-            kept[labels.take(end, axis)] = True
-    kept[0] = False
-    return kept[labels]
-
-
-def _trim(body: np.ndarray, offset: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Remove outermost voxels of thick parts whose centre lies outside the surface.
-
-    Otherwise a body would grow by half a voxel all around. Points on the surface are at `offset` (n, 3) from the
-    centres of the voxels `at` (n,) of the flat grid [voxels].
-    """
-    skin = _thick_skin(body)
-    some = skin.ravel()[at]
-    at, offset = at[some], offset[some]
-    slope = np.gradient(ndimage.gaussian_filter(body.astype(np.float32), 1.0))  # points inward
-    depth = sum(offset[:, a] * slope[a].ravel()[at] for a in range(3))
-    return body & ~(skin & (np.bincount(at, depth, body.size).reshape(body.shape) > 0))
-
-
-def _thick_skin(body: np.ndarray) -> np.ndarray:
-    """The outermost voxels where the body is at least five voxels thick."""
-    core = eroded(body, 2)
-    return body & ~eroded(body) & dilated(core, 3)
-
-
-def _largest(body: np.ndarray) -> np.ndarray:
-    """Remove connected components smaller than a fiftieth of the largest."""
-    labels, n = ndimage.label(body, np.ones((3, 3, 3)))
-    if n <= 1:
-        return body
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return (sizes >= sizes.max() / 50)[labels] & body
 
 
 def _without_overlap(bodies: list[np.ndarray]) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ import torch
 from scipy import ndimage
 
 from stages.core.errors import InputError
-from stages.core.physics import particles
+from stages.core.physics import body_filling, particles
 from stages.core.physics.particles import (
     MIN_PARTICLES,
     filled_voxels,
@@ -309,9 +309,9 @@ def voxels(shape, *blocks) -> np.ndarray:
 def test_specks_smaller_than_a_fiftieth_are_removed():
     large, speck, single = ((1, 1, 1), (4, 5, 5)), ((8, 1, 1), (8, 1, 2)), ((8, 8, 8), (8, 8, 8))
     body = voxels((10, 10, 10), large, speck, single)  # of 100, 2 and 1 voxels
-    assert np.array_equal(particles._largest(body), voxels(body.shape, large, speck))
+    assert np.array_equal(body_filling._largest(body), voxels(body.shape, large, speck))
     touching = voxels((10, 10, 10), large, ((5, 6, 6), (5, 6, 6)))  # by a corner
-    assert np.array_equal(particles._largest(touching), touching)
+    assert np.array_equal(body_filling._largest(touching), touching)
 
 
 def test_smaller_bodies_have_the_voxels_that_bodies_share():
@@ -327,7 +327,7 @@ def test_smaller_bodies_have_the_voxels_that_bodies_share():
 def test_skin_is_removed_where_a_body_is_five_voxels_thick():
     for thick, removed in ((4, False), (5, True)):
         slab = voxels((30, 30, thick + 6), ((0, 0, 3), (29, 29, 2 + thick)))
-        skin = particles._thick_skin(slab)[15, 15]
+        skin = body_filling.thick_skin(slab)[15, 15]
         assert np.flatnonzero(skin).tolist() == ([3, 2 + thick] if removed else [])
 
 
@@ -343,7 +343,7 @@ def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
     walls[1:-1, 1:-1, 1:-1] = False
     a = room - hole // 2
     walls &= ~voxels(walls.shape, ((a, a, last), (a + hole - 1, a + hole - 1, last)))
-    found = particles._cavities(walls, particles.LEAK_RADII)
+    found = body_filling._cavities(walls, body_filling.LEAK_RADII)
     assert found[room, room, room] == filled and not (found & walls).any()
     assert found[1:-1, 1:-1, 1 : room + 1].all() if filled else not found.any()
     if filled:  # up to the radius that closes the hole, and a voxel more, below it
@@ -353,9 +353,9 @@ def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
 def test_the_outside_reaches_in_through_holes():
     free = voxels((9, 9, 9), ((0, 0, 0), (8, 8, 8))) & ~voxels((9, 9, 9), ((2, 2, 2), (6, 6, 6)))
     free |= voxels((9, 9, 9), ((3, 3, 3), (5, 5, 5)))
-    assert not particles._outside(free)[4, 4, 4] and particles._outside(free)[0, 0, 0]
+    assert not body_filling._outside(free)[4, 4, 4] and body_filling._outside(free)[0, 0, 0]
     free[4, 4, 6] = True
-    assert np.array_equal(particles._outside(free), free)
+    assert np.array_equal(body_filling._outside(free), free)
 
 
 def test_the_voxels_of_a_body_do_not_depend_on_sparser_neighbours():
@@ -406,5 +406,5 @@ def test_a_cube_sampled_at_every_third_voxel_is_filled():
     every[6:25:3] = True
     cube = side[:, None, None] & side[:, None] & side
     shell = cube & ~ndimage.binary_erosion(cube) & (every[:, None, None] & every[:, None] & every)
-    body = particles._fill(shell, particles.within(shell, 3), 3, None, particles.LEAK_RADII, sealed=False)
+    body = body_filling._fill(shell, body_filling.within(shell, 3), 3, None, body_filling.LEAK_RADII, sealed=False)
     assert body[ndimage.binary_erosion(cube)].all() and not body[~cube].any()

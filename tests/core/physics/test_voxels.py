@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from stages.core.physics import particles, rigid_shapes
+from stages.core.physics import body_filling, particles, rigid_shapes
 from stages.core.physics.particles import MIN_PARTICLE_OPACITY, MIN_PARTICLES, scene_size, surface_points, usable
 from stages.core.scene.gaussians import concatenate
 from tests.core.physics.test_particles import scene, splats
@@ -90,9 +90,9 @@ def test_small_gaussians_are_sampled_once():
 def test_the_skin_of_a_cube_of_nine_voxels():
     """The outer layer of each face, without what is more than 3 steps from the 5 voxels in the middle."""
     cube = filled((13, 13, 13), block(9, 9, 9, low=(2, 2, 2)))
-    skin = particles._thick_skin(cube)
+    skin = body_filling.thick_skin(cube)
     assert skin.sum() == 6 * (5 * 5 + 2 * 2 * 5) and not skin[3:10, 3:10, 3:10].any()
-    assert not particles._thick_skin(filled((13, 13, 13), block(9, 9, 4, low=(2, 2, 2)))).any()  # too thin
+    assert not body_filling.thick_skin(filled((13, 13, 13), block(9, 9, 4, low=(2, 2, 2)))).any()  # too thin
 
 
 def test_trimming_removes_the_skin_whose_points_are_inside_the_centres_of_its_voxels():
@@ -100,27 +100,27 @@ def test_trimming_removes_the_skin_whose_points_are_inside_the_centres_of_its_vo
     outer = np.argwhere(cube & ~ndimage.binary_erosion(cube)) + 0.5
     towards = np.sign(7.5 - outer) * (np.abs(outer - 7.5) == 5)
     at = np.ravel_multi_index(tuple(np.floor(outer).astype(np.int64).T), cube.shape)
-    assert particles._trim(cube, 0.3 * towards, at).sum() == cube.sum() - particles._thick_skin(cube).sum()
-    assert (particles._trim(cube, -0.3 * towards, at) == cube).all()
+    assert body_filling._trim(cube, 0.3 * towards, at).sum() == cube.sum() - body_filling.thick_skin(cube).sum()
+    assert (body_filling._trim(cube, -0.3 * towards, at) == cube).all()
 
 
 def test_components_smaller_than_a_fiftieth_of_the_largest_are_removed():
     large, small, smaller = block(10, 10, 1), block(2, 1, 1, low=(0, 0, 5)), block(1, 1, 1, low=(9, 9, 9))
     touching = np.array([[9, 10, 1]])  # at a corner of the large one
     body = filled((12, 12, 12), large, small, smaller, touching)
-    assert (particles._largest(body) == filled(body.shape, large, touching)).all()  # 101 / 50 > 2
+    assert (body_filling._largest(body) == filled(body.shape, large, touching)).all()  # 101 / 50 > 2
     body[9, 10, 1] = False
-    assert (particles._largest(body) == filled(body.shape, large, small)).all()
-    assert (particles._largest(filled(body.shape, smaller)) == filled(body.shape, smaller)).all()
+    assert (body_filling._largest(body) == filled(body.shape, large, small)).all()
+    assert (body_filling._largest(filled(body.shape, smaller)) == filled(body.shape, smaller)).all()
 
 
 def test_what_is_outside_is_connected_with_a_face_of_the_grid():
     free = ~filled((7, 7, 7), block(5, 5, 5, low=(1, 1, 1)))
     free[3, 3, 3] = True
-    outside = particles._outside(free)
+    outside = body_filling._outside(free)
     assert outside.sum() == 7**3 - 5**3 and not outside[3, 3, 3]
     free[3, 3, 4] = free[3, 3, 5] = True
-    assert particles._outside(free)[3, 3, 3]
+    assert body_filling._outside(free)[3, 3, 3]
 
 
 def test_voxels_of_two_bodies_go_to_the_smaller_one():

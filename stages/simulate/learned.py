@@ -33,7 +33,14 @@ from stages.simulate.field_surfaces import body_surfaces
 from stages.simulate.held_bodies import HeldBodies
 from stages.simulate.model_units import TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
-from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, held_as_seen, set_up_scene
+from stages.simulate.setup import (
+    SceneSetup,
+    check_motion,
+    choose_for_bodies,
+    from_photos,
+    set_up_scene,
+    starts_released,
+)
 from stages.simulate.sleep import SleepState
 from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
@@ -102,9 +109,9 @@ def rollout(
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
-    awake = _starts_awake(initial, units, setup) | (not options.rest)
+    awake = _starts_awake(initial, units, setup) | starts_released(scene, options)
     if options.contact == "solved":
-        awake |= not held_as_seen(scene, options)
+        awake |= not from_photos(scene)  # elsewhere nothing is missing that keeps them at rest
         seen = centre_of_mass(initial, initial.points)[0] - units.length * setup.lift
         rest = HeldBodies(initial, surfaces, seen, awake, setup.on_floor_as_seen)
     else:

@@ -181,9 +181,14 @@ def from_photos(scene: Scene) -> bool:
     return "reconstruct" in scene.commands
 
 
+def starts_released(scene: Scene, options: SimulateOptions) -> bool:
+    """Whether all objects move from the start: with --no-rest, and in films, which begin as they are released."""
+    return not options.rest or scene.sequence is not None
+
+
 def held_as_seen(scene: Scene, options: SimulateOptions) -> bool:
-    """Whether objects are at rest where photos show them; not those of films, which begin as they are released."""
-    return options.rest and from_photos(scene) and scene.sequence is None
+    """Whether objects are at rest where photos show them."""
+    return from_photos(scene) and not starts_released(scene, options)
 
 
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:

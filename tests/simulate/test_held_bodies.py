@@ -1,15 +1,20 @@
 """Objects of photos in the learned field with solved contacts: held until something disturbs their equilibrium."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from stages.core.scene.sequence import FilmedSequence
 from stages.simulate.options import SimulateOptions
 from tests.simulate.motion import Motion, roll_out
 from tests.simulate.test_rigid import cube, scene_of, small_bodies  # noqa: F401 -- a fixture
 
 
-def roll(*surfaces, photos=True, **options) -> Motion:
+def roll(*surfaces, photos=True, film=False, **options) -> Motion:
     scene = scene_of(surfaces, photos=photos)
+    if film:
+        scene = replace(scene, sequence=FilmedSequence(50.0, 60, {"a": 3.0}))
     material = tuple(f"{o.id}=wood" for o in scene.objects)
     chosen = {"engine": "ngff", "contact": "solved", "keypoints": 32, "quality": "draft", "material": material}
     return roll_out(scene, SimulateOptions(**{**chosen, **options}))
@@ -20,9 +25,10 @@ def moved(t: Motion, row: int) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("film", [False, True])
 @pytest.mark.parametrize("contact", ["solved", "learned"])
-def test_with_no_rest_what_hangs_in_the_air_falls(contact):
-    t = roll(cube(0.1, 0, 0.15), steps=7, rest=False, contact=contact)
+def test_with_no_rest_and_in_films_what_hangs_in_the_air_falls(contact, film):
+    t = roll(cube(0.1, 0, 0.15), steps=7, rest=film, contact=contact, film=film)
     assert float(moved(t, 0)[2]) == pytest.approx(-9.81 * 0.12**2 / 2, rel=0.1)
 
 

@@ -96,6 +96,12 @@ class _Shape:
             normals, at_edge = normals[above], at_edge[above]
         return points, normals, at_edge
 
+    def planes(self) -> np.ndarray:
+        """Normals and offsets (f, 4) of the planes that bound it, 0 of them if it does not fill its hull."""
+        if self.hull is None:
+            return np.zeros((0, 4))
+        return np.concatenate([self._faces, [[0.0, 0.0, -1.0, self.floor]]])
+
     @cached_property
     def _faces(self) -> np.ndarray:
         """Normals and offsets (f, 4) of the hull's faces, one for those in a plane."""
@@ -126,7 +132,10 @@ def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], l
     near = cKDTree(arm.numpy()).query(points[row])[1]
     at, normals, flatness, faces = (torch.from_numpy(x).float() for x in (points[row], normals[row], flatness, faces))
     near, row, keypoint, nearest = map(torch.from_numpy, (near, row, keypoint, nearest))
-    return BodyGrid(*on_grid, keypoint, low, h, at, normals, near, row, flatness, faces, nearest)
+    planes = torch.from_numpy(shape.planes())
+    offsets = length * planes[:, 3] - planes[:, :3] @ start.double()
+    hull = torch.cat([planes[:, :3], offsets[:, None]], 1).float()
+    return BodyGrid(*on_grid, keypoint, low, h, at, normals, near, row, flatness, faces, nearest, hull=hull)
 
 
 def _overlaps(surfaces: BodySurfaces, com: Float[Tensor, "o 3"]) -> Float[Tensor, "o o"]:

@@ -13,6 +13,7 @@ import warp as wp
 
 from stages.core.geometry import surface_faces as faces
 from stages.core.kernels.field.groups import wait_for_group
+from stages.core.kernels.field.surface_lookup import SurfaceArrays, beyond_grid, closest_point, depth_at, nearest_node
 
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
 EXTREMES = wp.constant(9)  # kept of each: in eight directions, and the deepest
@@ -25,31 +26,7 @@ MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the w
 MIN_FACING = wp.constant(0.3)
 OPPOSED, CURVED, FACES = wp.constant(faces.OPPOSED), wp.constant(faces.CURVED), wp.constant(faces.FACES)
 STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
-CLOSEST_POINT_STEPS = wp.constant(3)  # to the point of a ball that is nearest to a surface
-
-
-@wp.struct
-class SurfaceArrays:
-    """BodySurfaces for kernels; its docstring has the fields."""
-
-    depth: wp.array[float]
-    smooth: wp.array[float]
-    keypoint: wp.array[int]
-    first: wp.array[int]
-    shape: wp.array[wp.vec3i]
-    low: wp.array[wp.vec3]
-    spacing: wp.array[float]
-    near: wp.array2d[int]
-    samples: wp.array2d[wp.vec3]
-    normals: wp.array2d[wp.vec3]
-    point: wp.array2d[int]
-    flatness: wp.array[float]
-    faces: wp.array2d[wp.vec3]
-    nearest: wp.array[int]
-    centre: wp.array[wp.vec3]
-    radius: wp.array[float]
-    reach: wp.array[float]
-    overlap: wp.array2d[float]
+NO_DISTANCE = wp.constant(1e-6)  # in radii of a ball, that has no direction
 
 
 @wp.struct
@@ -90,68 +67,6 @@ class NearPoint:
     gap: float  # [m]
     normal: wp.vec3  # of b, towards a
     facing: bool  # whether both surfaces face each other
-
-
-@wp.func
-def _node(s: SurfaceArrays, body: int, i: int, j: int, k: int) -> int:
-    n = s.shape[body]
-    return s.first[body] + (i * n[1] + j) * n[2] + k
-
-
-@wp.func
-def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
-    """Direction of steepest increase, and depth, at x in the frame of a body; see BodySurfaces.look_up."""
-    n = s.shape[body]
-    h = s.spacing[body]
-    place = (x - s.low[body]) / h
-    f = wp.vec3()
-    cell = wp.vec3i()
-    beyond = float(0.0)
-    for axis in range(3):
-        inside = wp.clamp(place[axis], 0.0, float(n[axis] - 1))
-        cell[axis] = wp.min(int(inside), n[axis] - 2)
-        f[axis] = inside - float(cell[axis])
-        beyond += (place[axis] - inside) * (place[axis] - inside) * h * h
-    depth = float(0.0)
-    slope = wp.vec3()
-    for corner in range(8):
-        i = corner // 4
-        j = (corner // 2) % 2
-        k = corner % 2
-        u = wp.where(i == 1, f[0], 1.0 - f[0])
-        v = wp.where(j == 1, f[1], 1.0 - f[1])
-        w = wp.where(k == 1, f[2], 1.0 - f[2])
-        row = _node(s, body, cell[0] + i, cell[1] + j, cell[2] + k)
-        depth += s.depth[row] * u * v * w
-        smooth = s.smooth[row]
-        slope += smooth * wp.vec3(float(2 * i - 1) * v * w, float(2 * j - 1) * u * w, float(2 * k - 1) * u * v)
-    if beyond > 0.0:  # the body is in the box of its grid, so the angle at the box's nearest point is at least right
-        outside = wp.min(depth, 0.0)
-        depth = -wp.sqrt(beyond + outside * outside)
-    slope = slope / wp.max(wp.length(slope), 1.0e-12)
-    return wp.vec4(slope[0], slope[1], slope[2], depth)
-
-
-@wp.func
-def _beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
-    """How far x in the frame of a body is from the box of its grid, along one axis."""
-    low = s.low[body]
-    out = float(0.0)
-    for axis in range(3):
-        end = low[axis] + s.spacing[body] * float(s.shape[body][axis] - 1)
-        out = wp.max(out, wp.max(low[axis] - x[axis], x[axis] - end))
-    return out
-
-
-@wp.func
-def _nearest_node(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
-    """The row of the node nearest to x in the frame of a body."""
-    n = s.shape[body]
-    place = (x - s.low[body]) / s.spacing[body]
-    i = wp.clamp(int(wp.round(place[0])), 0, n[0] - 1)
-    j = wp.clamp(int(wp.round(place[1])), 0, n[1] - 1)
-    k = wp.clamp(int(wp.round(place[2])), 0, n[2] - 1)
-    return _node(s, body, i, j, k)
 
 
 @wp.func
@@ -203,7 +118,7 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
     # Where b has an edge its depths increase in an oblique direction. The normal is that of a face: of faces that are
     # parallel the one of the flatter surface, else that of a if its sample is on one.
     p = s.point[a, q]
-    r = s.nearest[_nearest_node(s, b, x)]
+    r = s.nearest[nearest_node(s, b, x)]
     most = float(-1.0)
     opposite = wp.vec3()
     if r >= 0:
@@ -231,13 +146,14 @@ def ball_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) ->
     apart = centre - (poses.com[scene, b] + poses.R[scene, b] * s.centre[b])
     out.normal = wp.normalize(apart)
     out.gap = wp.length(apart) - s.radius[a] - s.radius[b]
-    out.at = centre - s.radius[a] * out.normal
     if s.radius[b] == 0.0:
-        for _ in range(CLOSEST_POINT_STEPS):
-            found = depth_at(s, b, _local(poses, scene, b, out.at))
-            out.gap = -found[3]
-            out.normal = -(poses.R[scene, b] * wp.vec3(found[0], found[1], found[2]))
-            out.at = centre - s.radius[a] * out.normal
+        on = closest_point(s, b, _local(poses, scene, b, centre))
+        outward = centre - (poses.com[scene, b] + poses.R[scene, b] * on.at)
+        normal = poses.R[scene, b] * on.normal
+        side = wp.where(wp.dot(outward, normal) < 0.0, -1.0, 1.0)  # the centre may be inside
+        out.gap = side * wp.length(outward) - s.radius[a]
+        out.normal = wp.where(wp.length(outward) > NO_DISTANCE * s.radius[a], side * wp.normalize(outward), normal)
+    out.at = centre - s.radius[a] * out.normal
     out.gap += s.overlap[a, b]
     out.facing = True
     return out
@@ -309,12 +225,12 @@ def _look_at(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair:
                 found.side[scene, pair, q] = wp.int8(side)
         return
     x = _local(poses, scene, b, at)
-    if _beyond_grid(s, b, x) < margin:
+    if beyond_grid(s, b, x) < margin:
         point = sample_near(s, poses, scene, a, b, q)
         if point.gap < margin and point.facing:
             found.gap[scene, pair, q] = point.gap
             found.side[scene, pair, q] = wp.int8(_side_of(point.normal))
-            found.other[scene, pair, q] = s.keypoint[_nearest_node(s, b, x)]
+            found.other[scene, pair, q] = s.keypoint[nearest_node(s, b, x)]
 
 
 @wp.func

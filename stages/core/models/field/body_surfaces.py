@@ -36,6 +36,7 @@ class BodyGrid:
     faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
     nearest: Int[Tensor, "x y z"]  # point nearest to each node; -1 far from the surface
     ball: tuple[Float[Tensor, "3"], float] | None = None  # its centre and radius, if the body is one
+    hull: Float[Tensor, "f 4"] = torch.zeros(0, 4)  # normals and offsets of its faces, if it is convex
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class BodySurfaces:
     nearest: Int[Tensor, "g"]  # point nearest to each node; -1 far from the surface
     centre: Float[Tensor, "o 3"]  # of a ball
     radius: Float[Tensor, "o"]  # of a ball; 0 for other bodies
+    hull: Float[Tensor, "h 4"]  # normals and offsets of the faces of convex bodies [1, m]
+    hull_first: Int[Tensor, "o"]  # row of each body's first face
+    hull_faces: Int[Tensor, "o"]  # number of faces; 0 of bodies that are not convex
     reach: Float[Tensor, "o"]  # of the samples about the centre of mass [m]
     overlap: Float[Tensor, "o o"]  # of each body with another at the start, which is no contact [m]
 
@@ -74,6 +78,7 @@ class BodySurfaces:
         first = points.cumsum(0) - points
         nearest = [torch.where(g.nearest < 0, -1, first[i] + g.nearest).flatten() for i, g in enumerate(grids)]
         none = at.new_zeros(3), 0.0
+        hulls = torch.tensor([len(g.hull) for g in grids])
         balls = [none if g.ball is None else g.ball for g in grids]
         return cls(
             **flat, first=sizes.cumsum(0) - sizes, shape=torch.tensor([g.depth.shape for g in grids]),
@@ -82,6 +87,7 @@ class BodySurfaces:
             flatness=torch.cat([g.flatness for g in grids]), faces=torch.cat([g.faces for g in grids]),
             nearest=torch.cat(nearest),
             centre=torch.stack([centre for centre, _ in balls]), radius=at.new_tensor([radius for _, radius in balls]),
+            hull=torch.cat([g.hull for g in grids]), hull_first=hulls.cumsum(0) - hulls, hull_faces=hulls,
             reach=at.norm(dim=-1).amax(-1), overlap=at.new_zeros(len(grids), len(grids)),
         )  # fmt: skip
 

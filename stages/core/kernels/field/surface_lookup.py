@@ -1,0 +1,246 @@
+"""Look-ups in the surfaces of rigid bodies: depths on their grids, and closest points."""
+
+from __future__ import annotations
+
+import warp as wp
+
+f64 = wp.float64
+NO_FACE = wp.constant(-1)
+GRID_STEPS = wp.constant(6)  # from the nearest sample to the closest point of a surface on a grid
+STEP = wp.constant(2.0)  # longest of them, in nodes of the grid
+HULL_STEPS = wp.constant(32)  # to that of a hull; each adds a face, and about as many as three are needed
+ON_FACE = wp.constant(wp.float64(1e-6))  # distance from a face at which a point is on it, in sizes of the body
+
+
+@wp.struct
+class SurfaceArrays:
+    """BodySurfaces for kernels; its docstring has the fields."""
+
+    depth: wp.array[float]
+    smooth: wp.array[float]
+    keypoint: wp.array[int]
+    first: wp.array[int]
+    shape: wp.array[wp.vec3i]
+    low: wp.array[wp.vec3]
+    spacing: wp.array[float]
+    near: wp.array2d[int]
+    samples: wp.array2d[wp.vec3]
+    normals: wp.array2d[wp.vec3]
+    point: wp.array2d[int]
+    flatness: wp.array[float]
+    faces: wp.array2d[wp.vec3]
+    nearest: wp.array[int]
+    centre: wp.array[wp.vec3]
+    radius: wp.array[float]
+    reach: wp.array[float]
+    hull: wp.array[wp.vec4]
+    hull_first: wp.array[int]
+    hull_faces: wp.array[int]
+    overlap: wp.array2d[float]
+
+
+@wp.struct
+class SurfacePoint:
+    """A point of the surface of a body, in its frame."""
+
+    at: wp.vec3
+    normal: wp.vec3  # outwards
+
+
+@wp.func
+def _node(s: SurfaceArrays, body: int, i: int, j: int, k: int) -> int:
+    n = s.shape[body]
+    return s.first[body] + (i * n[1] + j) * n[2] + k
+
+
+@wp.func
+def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
+    """Direction of steepest increase, and depth, at x in the frame of a body; see BodySurfaces.look_up."""
+    n = s.shape[body]
+    h = s.spacing[body]
+    place = (x - s.low[body]) / h
+    f = wp.vec3()
+    cell = wp.vec3i()
+    beyond = float(0.0)
+    for axis in range(3):
+        inside = wp.clamp(place[axis], 0.0, float(n[axis] - 1))
+        cell[axis] = wp.min(int(inside), n[axis] - 2)
+        f[axis] = inside - float(cell[axis])
+        beyond += (place[axis] - inside) * (place[axis] - inside) * h * h
+    depth = float(0.0)
+    slope = wp.vec3()
+    for corner in range(8):
+        i = corner // 4
+        j = (corner // 2) % 2
+        k = corner % 2
+        u = wp.where(i == 1, f[0], 1.0 - f[0])
+        v = wp.where(j == 1, f[1], 1.0 - f[1])
+        w = wp.where(k == 1, f[2], 1.0 - f[2])
+        row = _node(s, body, cell[0] + i, cell[1] + j, cell[2] + k)
+        depth += s.depth[row] * u * v * w
+        smooth = s.smooth[row]
+        slope += smooth * wp.vec3(float(2 * i - 1) * v * w, float(2 * j - 1) * u * w, float(2 * k - 1) * u * v)
+    if beyond > 0.0:  # the body is in the box of its grid, so the angle at the box's nearest point is at least right
+        outside = wp.min(depth, 0.0)
+        depth = -wp.sqrt(beyond + outside * outside)
+    slope = slope / wp.max(wp.length(slope), 1.0e-12)
+    return wp.vec4(slope[0], slope[1], slope[2], depth)
+
+
+@wp.func
+def beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
+    """How far x in the frame of a body is from the box of its grid, along one axis."""
+    low = s.low[body]
+    out = float(0.0)
+    for axis in range(3):
+        end = low[axis] + s.spacing[body] * float(s.shape[body][axis] - 1)
+        out = wp.max(out, wp.max(low[axis] - x[axis], x[axis] - end))
+    return out
+
+
+@wp.func
+def nearest_node(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
+    """The row of the node nearest to x in the frame of a body."""
+    n = s.shape[body]
+    place = (x - s.low[body]) / s.spacing[body]
+    i = wp.clamp(int(wp.round(place[0])), 0, n[0] - 1)
+    j = wp.clamp(int(wp.round(place[1])), 0, n[1] - 1)
+    k = wp.clamp(int(wp.round(place[2])), 0, n[2] - 1)
+    return _node(s, body, i, j, k)
+
+
+@wp.func
+def _normal_of_face(s: SurfaceArrays, face: int) -> wp.vec3d:
+    plane = s.hull[face]
+    return wp.vec3d(f64(plane[0]), f64(plane[1]), f64(plane[2]))
+
+
+@wp.func
+def _beyond_face(s: SurfaceArrays, face: int, x: wp.vec3d) -> f64:
+    """How far x in the frame of a body is outside the plane of a face of its hull."""
+    return wp.dot(_normal_of_face(s, face), x) + f64(s.hull[face][3])
+
+
+@wp.func
+def _outermost_face(s: SurfaceArrays, body: int, x: wp.vec3d) -> int:
+    """The face of the hull of a body from which x is farthest outside."""
+    first = s.hull_first[body]
+    out = first
+    most = _beyond_face(s, first, x)
+    for face in range(first + 1, first + s.hull_faces[body]):
+        beyond = _beyond_face(s, face, x)
+        if beyond > most:
+            most = beyond
+            out = face
+    return out
+
+
+@wp.func
+def _projected(s: SurfaceArrays, faces: wp.vec3i, x: wp.vec3d) -> wp.vec4d:
+    """The projection of x on the intersection of the planes of up to three faces, and its least multiplier [m]."""
+    normals = wp.mat33d()
+    beyond = wp.vec3d()
+    for k in range(3):
+        if faces[k] != NO_FACE:
+            normals[k] = _normal_of_face(s, faces[k])
+            beyond[k] = _beyond_face(s, faces[k], x)
+    gram = normals * wp.transpose(normals)
+    for k in range(3):
+        gram[k, k] = f64(1.0)  # also of none
+    multipliers = wp.inverse(gram) * beyond
+    at = x - wp.transpose(normals) * multipliers
+    return wp.vec4d(at[0], at[1], at[2], wp.min(multipliers))
+
+
+@wp.func
+def _closest_point_of_hull(s: SurfaceArrays, body: int, point: wp.vec3) -> SurfacePoint:
+    """The closest point of a convex body: it is projected on the face from which it is farthest outside, then on the
+    intersection of the planes of that and of up to two of those before, as long as others have it outside.
+
+    Source: the basis computation of linear-type programs, Sharir and Welzl 1992, for the projection on a polyhedron.
+    """
+    x = wp.vec3d(f64(point[0]), f64(point[1]), f64(point[2]))
+    tolerance = ON_FACE * f64(s.reach[body])
+    active = wp.vec3i(NO_FACE, NO_FACE, NO_FACE)
+    face = _outermost_face(s, body, x)
+    normal = _normal_of_face(s, face)
+    beyond = _beyond_face(s, face, x)
+    at = x
+    if beyond <= f64(0.0):
+        at = x - beyond * normal
+    for _ in range(HULL_STEPS):
+        if _beyond_face(s, face, at) <= tolerance:
+            break
+        before = active
+        found = bool(False)
+        for i in range(-1, 3):
+            for j in range(i + 1, 3):  # with at most two of those before: of none (i = -1) or two
+                trial = wp.vec3i(face, NO_FACE, before[j])
+                if i >= 0:
+                    trial[1] = before[i]
+                projected = _projected(s, trial, x)
+                candidate = wp.vec3d(projected[0], projected[1], projected[2])
+                feasible = projected[3] >= -tolerance
+                for k in range(3):
+                    if before[k] != NO_FACE:
+                        feasible = feasible and _beyond_face(s, before[k], candidate) <= tolerance
+                if feasible and not found:
+                    found = True
+                    active = trial
+                    at = candidate
+        if not found:
+            break
+        face = _outermost_face(s, body, at)
+    out = SurfacePoint()
+    out.at = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+    out.normal = wp.vec3(float(normal[0]), float(normal[1]), float(normal[2]))
+    return out
+
+
+@wp.func
+def _onto_surface(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
+    """The point of the surface near x, a few nodes of the grid away at most, and the normal there."""
+    out = SurfacePoint()
+    out.at = x
+    for _ in range(2):
+        found = depth_at(s, body, out.at)
+        out.normal = -wp.vec3(found[0], found[1], found[2])
+        out.at = out.at + found[3] * out.normal
+    return out
+
+
+@wp.func
+def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
+    """The closest point: from the nearest sample in steps along the tangent plane towards x, and back to the surface.
+
+    A step that does not come nearer, as the surface bends away from the plane, is halved.
+    """
+    nearest = int(0)
+    least = float(1.0e18)
+    for q in range(s.samples.shape[1]):
+        if s.near[body, q] >= 0:
+            distance = wp.length_sq(x - s.samples[body, q])
+            if distance < least:
+                least = distance
+                nearest = q
+    out = _onto_surface(s, body, s.samples[body, nearest])
+    share = float(1.0)
+    for _ in range(GRID_STEPS):
+        apart = x - out.at
+        way = share * (apart - wp.dot(apart, out.normal) * out.normal)
+        way *= wp.min(1.0, STEP * s.spacing[body] / wp.max(wp.length(way), 1.0e-12))
+        trial = _onto_surface(s, body, out.at + way)
+        if wp.length_sq(x - trial.at) < wp.length_sq(apart):
+            out.at = trial.at
+            out.normal = trial.normal
+        else:
+            share *= 0.5
+    return out
+
+
+@wp.func
+def closest_point(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
+    """The point of the surface of a body, no ball, that is closest to x in its frame."""
+    if s.hull_faces[body] > 0:
+        return _closest_point_of_hull(s, body, x)
+    return _closest_point_of_grid(s, body, x)

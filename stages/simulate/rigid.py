@@ -3,11 +3,11 @@
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
 
-A contact is a damped spring. Its damping ratio follows from the larger loss factor of both materials. Below REST_SPEED
-it is critically damped, since stacks that rebound at any speed never come to rest. The frequency is the highest that
-the substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is
-the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the contact slows down as
-they roll.
+A contact of convex bodies is a damped spring. Its damping ratio follows from the larger loss factor of both materials.
+Below REST_SPEED it is critically damped, since stacks that rebound at any speed never come to rest. The frequency is
+the highest that the substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The
+friction of a pair is the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the
+contact slows down as they roll.
 Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
 it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
 convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives
@@ -49,7 +49,7 @@ from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
-from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
+from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, damping_ratio, mujoco_model, restitution
 from stages.simulate.setup import (
     SceneSetup,
     check_motion,
@@ -220,7 +220,7 @@ class _World:
             self.mass[row] = b.mass * m.density / b.material.density
             for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
                 model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
-                model.geom_solref[geom, 1] = -2 * b.damping(m) * OMEGA
+                model.geom_solref[geom, 1] = -2 * damping_ratio(m.loss) * OMEGA
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
         free = {self._ids[i]: k for k, i in enumerate(self._free)}
         self._held = {k: self.data.qpos[FREE * k : FREE * (k + 1)].copy() for id, k in free.items() if id in pinned}
@@ -338,19 +338,23 @@ class _World:
         """Damp slow contacts critically, and let friction stop slip within a substep. Returns the constraint rows (k,)
         of the contacts' normals, and the friction coefficients (k,).
 
-        The contacts after the first `count` are those of surfaces: inelastic, and pushed apart slowly.
+        The contacts after the first `count` are those of surfaces: they rebound within a substep, by Newton's law, and
+        are pushed apart slowly.
         """
-        data = self.data
+        data, timestep = self.data, self.model.opt.timestep
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
-        speed = data.efc_vel[normal]
-        missing = np.maximum(2 * OMEGA - data.efc_KBIP[normal, 1], 0)
+        speed, damping = data.efc_vel[normal], data.efc_KBIP[normal, 1]
+        missing = np.maximum(2 * OMEGA - damping, 0)
         data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
-        soft = normal[active[:count].sum() :]
-        push = np.minimum(-(OMEGA**2) * data.efc_pos[soft], 2 * OMEGA * REST_SPEED)
-        data.efc_aref[soft] = push - 2 * OMEGA * data.efc_vel[soft]
+        first = active[:count].sum()
+        soft, speed = normal[first:], speed[first:]
+        push = np.minimum(-(OMEGA**2) * data.efc_pos[soft], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
+        share = (-speed / REST_SPEED - 1).clip(0, 1)  # of twice that speed or more all of them rebounds
+        rebound = share * restitution(damping[first:] / (2 * OMEGA)) * -speed
+        data.efc_aref[soft] = np.where(rebound > 0, (rebound - speed) / timestep, push)
         along = normal[:, None] + [1, 2]
-        data.efc_aref[along] = -data.efc_vel[along] / self.model.opt.timestep
+        data.efc_aref[along] = -data.efc_vel[along] / timestep
         return normal, data.contact.friction[active, 0]
 
     def _solve(self, normal: np.ndarray, friction: np.ndarray) -> None:

@@ -15,7 +15,6 @@ from stages.core.physics.rigid_shapes import RigidShape
 
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
 CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
-ROUGH_DAMPING = 0.4  # least damping ratio of bodies that are not convex, whose contacts come and go in a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
 
@@ -46,10 +45,6 @@ class Body:
     pinned: bool
     ground: float  # height of the plane under it [m]
 
-    def damping(self, material: Material) -> float:
-        """Ratio to critical of a contact's damping."""
-        return max(damping_ratio(material.loss), 0.0 if self.shape.convex else ROUGH_DAMPING)
-
     def rolling_arm(self, radius: float, gravity: float) -> float:
         """Moment that resists rolling on a rigid plane, of a ball of this radius [m] under its weight, per weight [m].
 
@@ -77,6 +72,12 @@ def damping_ratio(loss: float) -> float:
         slope = 2 * (math.acos(z) / root**3 - z / root**2)
         z = min(z + (target - value) / slope, 1 - 1e-9)
     return z
+
+
+def restitution(damping: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    """Share of the speed that contacts with these ratios of their damping to critical restore; see `damping_ratio`."""
+    z = np.minimum(damping, 1 - 1e-9)
+    return np.exp(-2 * z * np.arccos(z) / np.sqrt(1 - z * z))
 
 
 def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: Sequence[float], box: Sequence | None,
@@ -133,7 +134,7 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, im
     if not b.pinned:
         body.add_freejoint()
     # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
-    contact = {"solref": [-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], "solimp": impedance}
+    contact = {"solref": [-(OMEGA**2), -2 * damping_ratio(b.material.loss) * OMEGA], "solimp": impedance}
     ball = b.shape.ball
     if ball is not None:  # a polyhedron loses energy where it rolls over its edges
         arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)

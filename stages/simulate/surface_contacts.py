@@ -5,9 +5,10 @@ Where one of two bodies is not convex, samples of each surface are looked up in 
 outermost samples of a body that is not convex touch the floor and walls. MuJoCo's contacts of the hulls of such pairs
 are excluded; those of convex bodies and those with the background stay.
 
-Contacts between surfaces are inelastic: critically damped, and pushed apart at no more than the speed at which contacts
-do not rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies
-at the start is no contact, nor the least one since (`initial_overlaps.py`).
+A sample that meets an edge or a thin wall may be deep inside at once, so that these contacts are no springs: they
+reverse the speed of approach, times the restitution, within a substep (Newton's law of impact), and are pushed apart at
+no more than the speed at which contacts do not rebound. The overlap of two bodies at the start is no contact, nor the
+least one since (`initial_overlaps.py`).
 
 Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
 distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
@@ -137,15 +138,15 @@ class SurfaceContacts:
     def add(self, data, fixed: np.ndarray) -> int:
         """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move.
 
-        Returns the number of contacts that can rebound; those after them, between surfaces, do not.
+        Returns the number of those before.
         """
+        count = data.ncon
         fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
         speed = np.linalg.norm(velocity[:, :3], axis=1) + np.linalg.norm(velocity[:, 3:], axis=1) * self._radius[free]
         self._path[free] += speed * self._model.opt.timestep
         self._add_to_planes(data, fixed)
-        count = data.ncon
         self._update_lists(data, fixed)
         x, normal, depth, a, b = self._contacts(data)
         pair = np.minimum(a, b), np.maximum(a, b)

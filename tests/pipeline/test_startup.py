@@ -32,8 +32,10 @@ COMMANDS = {
     "refine scene.ply -o out.ply": {"h5py", "pycolmap", "scipy.optimize"},
     "simulate scene.ply --quality draft --steps 3 -o out.h5": {"cv2", "pycolmap", "scipy.optimize"},
     "render traj.h5 --resolution 32 -o out.png": {"pycolmap", "scipy.optimize"},
-    "render scene.ply --resolution 32 -o out.png": {"pycolmap", "scipy"},
     "evaluate traj.h5 --against traj.h5 -o out.json": {"cv2", "pycolmap", "scipy", "warp"},
+}
+SLOW_COMMANDS = {  # the same stages with scenes
+    "render scene.ply --resolution 32 -o out.png": {"pycolmap", "scipy"},
     "evaluate scene.ply --against scene.ply -o out.json": {"cv2", "h5py", "pycolmap", "warp"},
 }
 
@@ -72,8 +74,9 @@ def inputs(tmp_path_factory, device) -> Path:
     return folder
 
 
-def test_commands_do_not_import_what_they_do_not_use(inputs, device):
-    commands = {command: sorted(UNUSED | extra) for command, extra in COMMANDS.items()
+@pytest.mark.parametrize("chosen", [COMMANDS, pytest.param(SLOW_COMMANDS, marks=pytest.mark.slow)])
+def test_commands_do_not_import_what_they_do_not_use(inputs, device, chosen):
+    commands = {command: sorted(UNUSED | extra) for command, extra in chosen.items()
                 if find_spec("pycolmap") or not command.startswith("reconstruct")}  # fmt: skip
     rows = [(command.split() + ([] if command.startswith("evaluate") else ["--device", device]), unused)
             for command, unused in commands.items()]  # fmt: skip
@@ -81,4 +84,5 @@ def test_commands_do_not_import_what_they_do_not_use(inputs, device):
     done = subprocess.run([sys.executable, "-c", RUNNER, json.dumps(rows)], capture_output=True, text=True, cwd=inputs,
                           env={**os.environ, "PYTHONPATH": path})  # fmt: skip
     found = [json.loads(line) for line in (inputs / "found.txt").read_text().splitlines()]
+    (inputs / "found.txt").unlink()
     assert dict(zip(commands, found, strict=True)) == {command: [0, []] for command in commands}, done.stderr

@@ -140,7 +140,7 @@ def busy_session(world):
         yield cache(lambda engine: live_session(world, engine, patch, a_busy_user))
 
 
-@pytest.mark.parametrize("engine", ["ngff", "mpm", "rigid"])
+@pytest.mark.parametrize("engine", ["ngff", pytest.param("mpm", marks=pytest.mark.slow), "rigid"])
 def test_a_record_repeats_the_motion_exactly(busy_session, engine):
     live, keypoints, session, motion_of = busy_session(engine)
     record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))

@@ -83,7 +83,7 @@ def turned(p: mpm.Particles, degrees: float) -> torch.Tensor:
     return R
 
 
-@pytest.mark.parametrize(("degrees", "friction"), [(10, 0.0), (25, 0.3), (40, 0.0)])
+@pytest.mark.parametrize(("degrees", "friction"), [pytest.param(10, 0.0, marks=pytest.mark.slow), (25, 0.3), (40, 0.0)])
 def test_a_block_slides_down_a_slope_as_a_point_mass_does(device, degrees, friction):
     """Its leading edge is above the face of the slope: the plane of its front face must not stop it."""
     slab = block((-0.2, -0.1, -0.1), (0.9, 0.3, 0.0), friction, held=True)

@@ -19,8 +19,6 @@ QUICK = (
     "collision/momentum",
     "roll/25deg",
     "rocking/12deg",
-    "stack/heavy on soft",
-    "slide/slow friction=0.1",
     "bounce/friction=0.1 loss=0.02",
     "bounce/friction=0.5 loss=0.15",
 )  # what tests/simulate/test_rigid.py does not show in small

@@ -65,6 +65,7 @@ def test_the_true_motion_explains_the_pictures_best(slide):
     )
 
 
+@pytest.mark.slow
 def test_friction_and_velocity_are_found_from_near_in_pictures_alone(slide):
     toy, _, _, problem = slide
     exact = true_point(problem, toy)

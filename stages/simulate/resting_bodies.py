@@ -77,16 +77,22 @@ class RestingBodies:
             data.qvel.reshape(-1, FALLING)[self.held] = 0
 
     def release_disturbed(self, data) -> list[int]:
-        """After a substep: release the bodies that contact forces would move; returns them."""
+        """Release the bodies that the contact forces of a substep would move; returns them.
+
+        Those forces are on bodies that were held: they are to be found again if there are any.
+        """
         if not self.held.any():
             return []
         model = self._model
         wrench = data.qfrc_constraint.reshape(-1, FALLING)  # on held bodies, which are not turned: in world axes
         mass = model.body_mass[self._bodies]
         excess = excess_force(wrench, -model.opt.gravity[2] * mass, self._friction, self._height, self._half_width)
-        self._impulse = np.where(excess > 0, self._impulse + excess * model.opt.timestep, 0.0)
-        moved = self.held & (self._impulse > mass * RELEASE_SPEED)
-        return self.release(self._bodies[moved]) if moved.any() else []
+        impulse = np.where(excess > 0, self._impulse + excess * model.opt.timestep, 0.0)
+        moved = self.held & (impulse > mass * RELEASE_SPEED)
+        if moved.any():
+            return self.release(self._bodies[moved])
+        self._impulse = impulse
+        return []
 
     def release(self, bodies: Iterable[int]) -> list[int]:
         """Release bodies, if they are held, and those that rest on them; returns those that were held."""

@@ -3,17 +3,17 @@
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
 
-A contact of convex bodies is a damped spring. Its damping ratio follows from the larger loss factor of both materials.
-Below REST_SPEED it is critically damped, since stacks that rebound at any speed never come to rest. The frequency is
-the highest that the substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The
-friction of a pair is the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the
-contact slows down as they roll.
+A contact reverses the speed of approach, times the restitution, within a substep (Newton's law of impact); that follows
+from the larger loss factor of both materials. Below REST_SPEED nothing rebounds, since stacks that rebound at any speed
+never come to rest: critically damped springs then push bodies apart, at no more than that speed, since a body that
+meets an edge may be deep inside at once. Their frequency is the highest that the substep resolves, so that resting
+bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the
+others. Round bodies are balls, which a loss of energy in the contact slows down as they roll.
 Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
 it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
 convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives
 them energy. So that speed, known from the previous pass, is subtracted and the forces are solved for again.
-Sources: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
-spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited"; exact friction from
+Sources: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; exact friction from
 the relaxed one: De Saxce and Feng 1998, "The bipotential method"; Le Lidec et al. 2024, "Contact models in robotics".
 
 Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
@@ -49,7 +49,7 @@ from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
-from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, damping_ratio, mujoco_model, restitution
+from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model, restitution
 from stages.simulate.setup import (
     SceneSetup,
     check_motion,
@@ -181,6 +181,9 @@ class _World:
         levels = [floor / size] if table is None else [floor / size, table.ground * unit / size]
         self.model = mujoco_model(bodies, self.units, gravity, levels, box if options.box else None, around)
         self.data = mujoco.MjData(self.model)
+        self._restitution = np.ones(self.model.ngeom)
+        for row, b in enumerate(bodies):
+            self._restitution[self.model.geom_bodyid == row + 1] = restitution(b.material.loss)
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
         for k, i in enumerate(self._free):
             self.data.qvel[FALLING * k : FALLING * k + 3] = velocity[i].numpy() * self.units.time / size
@@ -220,7 +223,7 @@ class _World:
             self.mass[row] = b.mass * m.density / b.material.density
             for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
                 model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
-                model.geom_solref[geom, 1] = -2 * damping_ratio(m.loss) * OMEGA
+                self._restitution[geom] = restitution(m.loss)
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
         free = {self._ids[i]: k for k, i in enumerate(self._free)}
         self._held = {k: self.data.qpos[FREE * k : FREE * (k + 1)].copy() for id, k in free.items() if id in pinned}
@@ -305,15 +308,26 @@ class _World:
             self._step()
 
     def _step(self) -> None:
-        """A substep: mj_step with other reference accelerations of contacts."""
+        """A substep. What contacts release takes part in them."""
+        self._find_forces()
+        while self._resting.release_disturbed(self.data):
+            self._find_forces()
+        self._mujoco.mj_Euler(self.model, self.data)
+        self._resting.restore(self.data, self._start)
+        for k, pose in self._held.items():
+            self.data.qpos[FREE * k : FREE * (k + 1)] = pose
+            self.data.qvel[FALLING * k : FALLING * (k + 1)] = 0
+
+    def _find_forces(self) -> None:
+        """As mj_forward, with other contacts and references."""
         mujoco, model, data = self._mujoco, self.model, self.data
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
                       mujoco.mj_collision):  # fmt: skip
             stage(model, data)
-        found = count = data.ncon
+        found = data.ncon
         if self._surfaces is not None:
             self._surfaces.exclude(data)
-            count = self._surfaces.add(data, self._resting.fixed)
+            self._surfaces.add(data, self._resting.fixed)
         if self._edges is not None:
             self._edges.apply(data, self._resting.fixed)
         for stage in (mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint):
@@ -324,35 +338,22 @@ class _World:
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         if data.nefc:
-            self._solve(*self._set_references(count))
+            self._solve(*self._set_references())
         else:
             mujoco.mj_fwdConstraint(model, data)
-        mujoco.mj_Euler(model, data)
-        self._resting.restore(data, self._start)
-        self._resting.release_disturbed(data)
-        for k, pose in self._held.items():
-            data.qpos[FREE * k : FREE * (k + 1)] = pose
-            data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
-    def _set_references(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Damp slow contacts critically, and let friction stop slip within a substep. Returns the constraint rows (k,)
-        of the contacts' normals, and the friction coefficients (k,).
-
-        The contacts after the first `count` are those of surfaces: they rebound within a substep, by Newton's law, and
-        are pushed apart slowly.
+    def _set_references(self) -> tuple[np.ndarray, np.ndarray]:
+        """Let contacts rebound within a substep, push slow ones apart, and let friction stop slip within a substep.
+        Returns the constraint rows (k,) of the contacts' normals, and the friction coefficients (k,).
         """
         data, timestep = self.data, self.model.opt.timestep
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
-        speed, damping = data.efc_vel[normal], data.efc_KBIP[normal, 1]
-        missing = np.maximum(2 * OMEGA - damping, 0)
-        data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
-        first = active[:count].sum()
-        soft, speed = normal[first:], speed[first:]
-        push = np.minimum(-(OMEGA**2) * data.efc_pos[soft], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
+        speed = data.efc_vel[normal]
+        push = np.minimum(-(OMEGA**2) * data.efc_pos[normal], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
         share = (-speed / REST_SPEED - 1).clip(0, 1)  # of twice that speed or more all of them rebounds
-        rebound = share * restitution(damping[first:] / (2 * OMEGA)) * -speed
-        data.efc_aref[soft] = np.where(rebound > 0, (rebound - speed) / timestep, push)
+        rebound = share * self._restitution[data.contact.geom[active]].min(1) * -speed
+        data.efc_aref[normal] = np.where(rebound > 0, (rebound - speed) / timestep, push)
         along = normal[:, None] + [1, 2]
         data.efc_aref[along] = -data.efc_vel[along] / timestep
         return normal, data.contact.friction[active, 0]

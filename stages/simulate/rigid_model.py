@@ -14,7 +14,7 @@ from stages.core.physics.materials import Material
 from stages.core.physics.rigid_shapes import RigidShape
 
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
-CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
+CONTACT_SUBSTEPS = 12  # half a period of the springs that push bodies apart
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
 
@@ -56,28 +56,9 @@ class Body:
         return 3 / 16 * contact * (1 - math.exp(-math.pi * m.loss))
 
 
-def damping_ratio(loss: float) -> float:
-    """Ratio to critical of the damping of a contact that restores exp(-pi loss / 2) of the speed; at most 1.
-
-    That is what half an oscillation of a spring with this loss factor leaves. A contact cannot pull, so that it ends
-    before: with z for the ratio, -log restitution = 2 z acos(z) / sqrt(1 - z^2) (Schwager and Poeschel 2007). Solved by
-    Newton's method; the right side is concave in z, so that it approaches from below.
-    """
-    target, z = math.pi * loss / 2, 0.0
-    if target >= 2:  # the limit at z = 1
-        return 1.0
-    for _ in range(30):
-        root = math.sqrt(1 - z * z)
-        value = 2 * z * math.acos(z) / root
-        slope = 2 * (math.acos(z) / root**3 - z / root**2)
-        z = min(z + (target - value) / slope, 1 - 1e-9)
-    return z
-
-
-def restitution(damping: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    """Share of the speed that contacts with these ratios of their damping to critical restore; see `damping_ratio`."""
-    z = np.minimum(damping, 1 - 1e-9)
-    return np.exp(-2 * z * np.arccos(z) / np.sqrt(1 - z * z))
+def restitution(loss: float) -> float:
+    """Share of the speed that half an oscillation of a spring with this loss factor leaves."""
+    return math.exp(-math.pi * loss / 2)
 
 
 def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: Sequence[float], box: Sequence | None,
@@ -101,7 +82,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     if box:
         planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
                    for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
-    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance, "solref": [-(OMEGA**2), 0]}
+    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance}
     for at, normal in planes:
         quat = np.zeros(4)
         mujoco.mju_quatZ2Vec(quat, np.array(normal))
@@ -133,16 +114,15 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, im
     body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     if not b.pinned:
         body.add_freejoint()
-    # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
-    contact = {"solref": [-(OMEGA**2), -2 * damping_ratio(b.material.loss) * OMEGA], "solimp": impedance}
     ball = b.shape.ball
     if ball is not None:  # a polyhedron loses energy where it rolls over its edges
         arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)
         at = (ball.centre - b.shape.com.double().numpy()) * unit / units.length
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[ball.radius * unit / units.length, 0, 0], pos=at,
-                      condim=6, friction=[b.friction, 0, arm / units.length], **contact)  # fmt: skip
+                      condim=6, friction=[b.friction, 0, arm / units.length], solimp=impedance)  # fmt: skip
         return
     vertices = (b.shape.hull - b.shape.com).double() * unit / units.length
     mesh = spec.add_mesh(name=name, uservert=vertices.flatten().tolist())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0], **contact)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
+                  solimp=impedance)  # fmt: skip

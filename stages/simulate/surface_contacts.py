@@ -5,10 +5,7 @@ Where one of two bodies is not convex, samples of each surface are looked up in 
 outermost samples of a body that is not convex touch the floor and walls. MuJoCo's contacts of the hulls of such pairs
 are excluded; those of convex bodies and those with the background stay.
 
-A sample that meets an edge or a thin wall may be deep inside at once, so that these contacts are no springs: they
-reverse the speed of approach, times the restitution, within a substep (Newton's law of impact), and are pushed apart at
-no more than the speed at which contacts do not rebound. The overlap of two bodies at the start is no contact, nor the
-least one since (`initial_overlaps.py`).
+The overlap of two bodies at the start is no contact, nor the least one since (`initial_overlaps.py`).
 
 Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
 distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
@@ -135,12 +132,8 @@ class SurfaceContacts:
         np.maximum.at(below, (self._corner_of[row], plane), depth)
         self._below = AllowedOverlaps(below)
 
-    def add(self, data, fixed: np.ndarray) -> int:
-        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move.
-
-        Returns the number of those before.
-        """
-        count = data.ncon
+    def add(self, data, fixed: np.ndarray) -> None:
+        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move."""
         fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
@@ -156,7 +149,6 @@ class SurfaceContacts:
         k = k[_extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
         at = x[k] + depth[k, None] / 2 * normal[k]
         add_contacts(self._mujoco, self._model, data, at, normal[k], excess[k], self._geom[b[k]], self._geom[a[k]])
-        return count
 
     def _add_to_planes(self, data, fixed: np.ndarray) -> None:
         """Contacts of the outermost samples with planes."""
@@ -296,7 +288,6 @@ def add_contacts(mujoco, model, data, x, normal, excess, one, two) -> None:
     added.frame[new] = _frames(normal)
     # as MuJoCo combines those of two geometries
     added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
-    added.solref[new] = np.minimum(model.geom_solref[one], model.geom_solref[two])
     added.solimp[new] = model.geom_solimp[one]
 
 

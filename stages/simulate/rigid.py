@@ -7,7 +7,7 @@ A contact reverses the speed of approach, times the restitution, within a subste
 from the larger loss factor of both materials. Below REST_SPEED nothing rebounds, since stacks that rebound at any speed
 never come to rest: critically damped springs then push bodies apart, at no more than that speed, since a body that
 meets an edge may be deep inside at once. Their frequency is the highest that the substep resolves, so that resting
-bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the
+bodies sink in by less than 1e-3 of the smallest object. Impacts that would give energy do not rebound. The friction of a pair is the larger coefficient, as in the
 others. Round bodies are balls, which a loss of energy in the contact slows down as they roll.
 Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
 it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
@@ -338,25 +338,43 @@ class _World:
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         if data.nefc:
-            self._solve(*self._set_references())
+            self._find_contact_forces()
         else:
             mujoco.mj_fwdConstraint(model, data)
 
-    def _set_references(self) -> tuple[np.ndarray, np.ndarray]:
+    def _find_contact_forces(self) -> None:
+        """Where contacts would give energy to the bodies that they connect none of them rebounds: Newton's law of impact
+        may do so where bodies are hit at several points at once.
+        """
+        data, timestep = self.data, self.model.opt.timestep
+        normal, friction, rebounds = self._set_references()
+        wanted = data.efc_aref[normal]
+        self._solve(normal, friction)
+        if not rebounds.any():
+            return
+        work = data.qfrc_constraint * (data.qvel + data.qacc * timestep / 2)
+        of_island = np.bincount(data.dof_island + 1, work)  # the first is that of bodies without contacts
+        stopped = rebounds & (of_island[data.efc_island[normal] + 1] > 0)
+        if stopped.any():
+            data.efc_aref[normal] = np.where(stopped, -data.efc_vel[normal] / timestep, wanted)
+            self._solve(normal, friction)
+
+    def _set_references(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Let contacts rebound within a substep, push slow ones apart, and let friction stop slip within a substep.
-        Returns the constraint rows (k,) of the contacts' normals, and the friction coefficients (k,).
+        Returns the constraint rows (k,) of the contacts' normals, the friction coefficients (k,), and which rebound (k,).
         """
         data, timestep = self.data, self.model.opt.timestep
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
         speed = data.efc_vel[normal]
-        push = np.minimum(-(OMEGA**2) * data.efc_pos[normal], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
+        spring = speed - timestep * (OMEGA**2 * data.efc_pos[normal] + 2 * OMEGA * speed)
         share = (-speed / REST_SPEED - 1).clip(0, 1)  # of twice that speed or more all of them rebounds
         rebound = share * self._restitution[data.contact.geom[active]].min(1) * -speed
-        data.efc_aref[normal] = np.where(rebound > 0, (rebound - speed) / timestep, push)
+        wanted = np.where(rebound > 0, rebound, np.minimum(spring, REST_SPEED))  # speed after the substep
+        data.efc_aref[normal] = (wanted - speed) / timestep
         along = normal[:, None] + [1, 2]
         data.efc_aref[along] = -data.efc_vel[along] / timestep
-        return normal, data.contact.friction[active, 0]
+        return normal, data.contact.friction[active, 0], rebound > 0
 
     def _solve(self, normal: np.ndarray, friction: np.ndarray) -> None:
         """Find the contact forces with exact Coulomb friction, by passes that know the slip after the previous one."""

@@ -399,8 +399,9 @@ def test_fast_contacts_rebound_within_a_substep_and_slow_ones_are_pushed_apart()
     world.model = SimpleNamespace(opt=SimpleNamespace(timestep=0.01))
     world._restitution = np.array([1.0, 0.6])
     world.data = contacts_at([-v, 0.0, v, v, -10 * v, -1.5 * v], [-d for d in (0.0, 1e-5, 1.0, 5.0, 0.0, 0.0)])
-    normal, friction = world._set_references()
+    normal, friction, rebounds = world._set_references()
     assert normal.tolist() == [0, 3, 6, 9, 12, 15] and friction.tolist() == [0.4] * 6
+    assert rebounds.tolist() == [False] * 4 + [True] * 2
     expected = [2 * OMEGA * v, OMEGA**2 * 1e-5, 0.0, 0.0, 10 * v * 1.6 / 0.01, 1.5 * v * 1.3 / 0.01]
     assert world.data.efc_aref[normal] == pytest.approx(expected)
     assert world.data.efc_aref[normal + 1].tolist() == [-100.0] * 6 and (world.data.efc_aref[normal + 2] == 200.0).all()

@@ -7,8 +7,9 @@ A contact reverses the speed of approach, times the restitution, within a subste
 from the larger loss factor of both materials. Below REST_SPEED nothing rebounds, since stacks that rebound at any speed
 never come to rest: critically damped springs then push bodies apart, at no more than that speed, since a body that
 meets an edge may be deep inside at once. Their frequency is the highest that the substep resolves, so that resting
-bodies sink in by less than 1e-3 of the smallest object. Impacts that would give energy do not rebound. The friction of a pair is the larger coefficient, as in the
-others. Round bodies are balls, which a loss of energy in the contact slows down as they roll.
+bodies sink in by less than 1e-3 of the smallest object. Impacts that would give energy to bodies do not rebound. The
+friction of a pair is the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the
+contact slows down as they roll.
 Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
 it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
 convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives
@@ -343,8 +344,9 @@ class _World:
             mujoco.mj_fwdConstraint(model, data)
 
     def _find_contact_forces(self) -> None:
-        """Where contacts would give energy to the bodies that they connect none of them rebounds: Newton's law of impact
-        may do so where bodies are hit at several points at once.
+        """Where contacts would give energy to the bodies that they connect, none of them rebounds.
+
+        Newton's law of impact may do so where bodies are hit at several points at once.
         """
         data, timestep = self.data, self.model.opt.timestep
         normal, friction, rebounds = self._set_references()
@@ -361,7 +363,8 @@ class _World:
 
     def _set_references(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Let contacts rebound within a substep, push slow ones apart, and let friction stop slip within a substep.
-        Returns the constraint rows (k,) of the contacts' normals, the friction coefficients (k,), and which rebound (k,).
+
+        Returns the constraint rows (k,) of the contacts' normals, friction coefficients (k,), and which (k,) rebound.
         """
         data, timestep = self.data, self.model.opt.timestep
         active = data.contact.efc_address >= 0

@@ -370,11 +370,10 @@ class _World:
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
         speed = data.efc_vel[normal]
-        spring = speed - timestep * (OMEGA**2 * data.efc_pos[normal] + 2 * OMEGA * speed)
+        push = np.minimum(-(OMEGA**2) * data.efc_pos[normal], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
         share = (-speed / REST_SPEED - 1).clip(0, 1)  # of twice that speed or more all of them rebounds
         rebound = share * self._restitution[data.contact.geom[active]].min(1) * -speed
-        wanted = np.where(rebound > 0, rebound, np.minimum(spring, REST_SPEED))  # speed after the substep
-        data.efc_aref[normal] = (wanted - speed) / timestep
+        data.efc_aref[normal] = np.where(rebound > 0, (rebound - speed) / timestep, push)
         along = normal[:, None] + [1, 2]
         data.efc_aref[along] = -data.efc_vel[along] / timestep
         return normal, data.contact.friction[active, 0], rebound > 0

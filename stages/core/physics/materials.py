@@ -70,7 +70,8 @@ PAPER = "GSCollision, E and density as published (Poisson 0.3); friction and los
 MATERIALS: Mapping[str, Material] = {
     # rubber: Poisson 0.49 in the handbook; 0.45 keeps pressure waves, and so the substep, affordable
     "rubber": Material(2e6, 930.0, 0.45, 0.8, 0.15, source=ASHBY + ": natural rubber 1.5-2.5 MPa"),
-    "common": Material(1e7, 540.0, 0.3, 0.5, 0.15, source="a guess: keeps its shape as hard rubber or thin plastic; "
+    "common": Material(1e7, 540.0, 0.3, 0.5, 0.4, source="a guess: keeps its shape as hard rubber or thin plastic, and "
+                       "half of the speed of an impact as household objects on a table; "
                        "density is the geometric mean of the ten objects of GSCollision"),
     "soft": Material(3e4, 120.0, 0.2, 0.6, 0.3, source=GIBSON + ": stuffing as a very open soft foam"),
     "foam": Material(1e5, 50.0, 0.2, 0.7, 0.3, source=ASHBY + ": flexible polymer foam 0.04-1 MPa, 38-70 kg/m3"),

@@ -1,9 +1,9 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
-penetration: deepest keypoint of an object inside another one or below the floor (only where the table goes on, with an
-engine that ends it), beyond the depth at rest and the one to which --lift put it there, of which a warning tells,
-relative to the smaller height of both. A keypoint outside its own mean surface, by noise or as a floater, counts by so
-much less; in other objects, so does one below the floor at rest, where bodies end.
+penetration: deepest keypoint of an object inside another one or below the floor (with an engine that ends the table:
+inside it, from its top or its sides), beyond the depth at rest and the one to which --lift put it there, of which a
+warning tells, relative to the smaller height of both. A keypoint outside its own mean surface, by noise or as a
+floater, counts by so much less; in other objects, so does one below the floor at rest, where bodies end.
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
@@ -90,7 +90,7 @@ class PlausibilityMonitor:
             if self._floor is not None and len(points[a]):
                 below, seen = (self._floor - p[:, 2] - self._outside(a) for p in (points[a], self._rest[a]))
                 if self._table is not None:
-                    below = np.where(self._table.beyond(points[a]) > 0, 0.0, below)
+                    below = np.minimum(below, np.maximum(-self._table.beyond(points[a]), 0.0))
                 self._record(a, float(below.max() - max(seen.max(), 0.0)), self._height[a], "the floor")
         near = ((low[:, None] < high) & (low < high[:, None])).all(-1) & (moved[:, None] | moved)
         for a, b in zip(*np.nonzero(near), strict=True):

@@ -5,14 +5,20 @@ import logging
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from stages.core.perception.table_outline import table_outline
+from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.keypoints import choose_keypoints
 from stages.core.physics.rigid_shapes import rigid_shapes
+from stages.core.physics.state import FrameState
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.plausibility import PlausibilityMonitor
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
 from tests.tables import GROUND, HIGH, table_scene
@@ -91,6 +97,19 @@ def test_what_slides_over_the_edge_lands_on_the_ground_and_does_not_sink(tmp_pat
     run(tmp_path / "scene.ply", tmp_path / "t.h5", options_of(tmp_path, floor=0.0, **options | {"steps": 25}))
     t = read_trajectory(tmp_path / "t.h5")
     assert float(t.com[-1, 0, 0]) > EDGE + 0.1 and float(t.com[-1, 0, 2]) == pytest.approx(0.02, abs=0.005)
+
+
+def test_depth_in_a_table_is_that_below_its_top_or_from_its_side(tmp_path):
+    """A block of height .04 whose end is below the top, .03 of it over the table or .01."""
+    scene = on_table(block(0.2))
+    keypoints, options = choose_keypoints(scene, 200), options_of(tmp_path)
+    com, no_turn = torch.tensor([[0.2, 0.0, 0.02]]), torch.tensor([[1.0, 0, 0, 0]])
+    edge = EDGE - float(table_outline(scene).beyond(np.array([[EDGE, 0.0]]))[0])  # as seen
+    for over, depth in ((0.03, 0.015), (0.01, 0.01)):
+        monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), options)
+        for shift in (torch.zeros(3), torch.tensor([edge + 0.06 - over - 0.2, 0.0, -0.015])):
+            monitor.add(FrameState(keypoints.rest + shift, com + shift, no_turn))
+        assert monitor.result()["objects"]["1"]["penetration"] == pytest.approx(depth / 0.04, abs=0.02)
 
 
 def test_engines_without_edges_say_so(tmp_path, caplog):

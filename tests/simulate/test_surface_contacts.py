@@ -35,10 +35,9 @@ class Pair:
         for k, at in enumerate((x, x + distance, *others)):
             body = spec.worldbody.add_body(pos=[at, 0, 0])
             body.add_freejoint()
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], friction=[0.1 + 0.2 * k, 0, 0],
-                          solref=[-1000, -10.0 - k])  # fmt: skip
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], friction=[0.1 + 0.2 * k, 0, 0])
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.19],
-                                friction=[0.2, 0, 0], solref=[-1000, 0])  # fmt: skip
+                                friction=[0.2, 0, 0])  # fmt: skip
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_fwdPosition(self.model, self.data)

@@ -2,8 +2,8 @@
 
 Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
 Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
-stays near its initial value, by a normal prior. Derivatives are by differences about as large as the uncertainty, in
-independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
+stays near its initial value, by a normal prior. Derivatives are by central differences about as large as the uncertainty,
+in independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
 noise remain, CMA-ES searches the region which the segments before have left.
 Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
 filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
@@ -221,12 +221,12 @@ def narrowed(
 
 
 def _derivatives(sims: Simulations, frames: int, known: Estimate) -> Float[np.ndarray, "n p"]:
-    """Derivatives of the residuals along the columns of the root, by differences within the ranges."""
-    ends = []
-    for step in NEAR[0] * known.root.T:
-        one, other = (np.clip(known.x + s, 0, 1) for s in (step, -step))
-        ends.append(step if np.linalg.norm(one - known.x) >= np.linalg.norm(other - known.x) else -step)
-    middle, *moved = sims.residuals([known.x, *(known.x + step for step in ends)], frames)
-    signs = [np.sign(step @ column) for step, column in zip(ends, known.root.T, strict=True)]
-    columns = [np.nan_to_num(m - middle) * (sign / NEAR[0]) for m, sign in zip(moved, signs, strict=True)]
-    return np.stack(columns, 1)
+    """Derivatives of the residuals along the columns of the root, by central differences within the ranges.
+
+    Differences to one side only are biased by the curvature of the residuals, which is large where pictures are
+    compared: the search then ends beside the minimum, along the parameters that trade against each other.
+    """
+    ends = [np.clip(known.x + step, 0, 1) for column in NEAR[0] * known.root.T for step in (column, -column)]
+    moved = np.nan_to_num(np.array(sims.residuals(ends, frames)))
+    lengths = np.linalg.norm(np.subtract(ends[::2], ends[1::2]), axis=1) / np.linalg.norm(known.root, axis=0)
+    return ((moved[::2] - moved[1::2]) / np.maximum(lengths, 1e-9)[:, None]).T

@@ -66,12 +66,13 @@ def test_the_true_motion_explains_the_pictures_best(slide):
 
 
 @pytest.mark.slow
-def test_friction_and_velocity_are_found_from_near_in_pictures_alone(slide):
+@pytest.mark.parametrize("level", [0, 1], ids=["coarse", "fine"])
+def test_friction_and_velocity_are_found_from_near_in_pictures_alone(level, slide):
     """And the motion within a millimetre at every keypoint and time, from ten: these trade against each other."""
     toy, _, _, problem = slide
     exact = true_point(problem, toy)
     near = Estimate(exact + [0.03, 0.0, 0.02, -0.02], np.diag([0.03, 0.05, 0.02, 0.02]))
-    with simulations(problem.levels[0], 1) as sims:  # coarse pictures; the true motion is judged in fine ones
+    with simulations(problem.levels[level], 1) as sims:
         x = descend(sims, FRAMES, near, sims.noise)
     truth, start, end = (problem.motion(point) for point in (exact, near.x, x))
     assert (start - truth).norm(dim=-1).max() > 0.005

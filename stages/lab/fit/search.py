@@ -2,9 +2,9 @@
 
 Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
 Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
-stays near its initial value, by a normal prior. Derivatives are by central differences about as large as the uncertainty,
-in independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
-noise remain, CMA-ES searches the region which the segments before have left.
+stays near its initial value, by a normal prior. Derivatives are by central differences about as large as the
+uncertainty, in independent directions: contacts make the motion a rough function of the parameters. Where residuals
+larger than the noise remain, CMA-ES searches the region which the segments before have left.
 Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
 filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
 """

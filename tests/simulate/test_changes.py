@@ -78,8 +78,8 @@ def test_what_rests_in_photos_moves_when_its_material_or_gravity_changes(apart, 
 def test_a_ball_rebounds_by_the_loss_of_the_material_that_it_has_become(apart):
     """From the floor, without gravity; of another material from the start, it rebounds alike."""
     speeds = {}
-    steel = Change("material", "steel", 0.04, 1)
-    for name, given, changes in (("before", (), ()), ("after", ("1=steel",), ()), ("changed", (), (steel,))):
+    rubber = Change("material", "rubber", 0.04, 1)
+    for name, given, changes in (("before", (), ()), ("after", ("1=rubber",), ()), ("changed", (), (rubber,))):
         prompts = ForcePrompts(velocity={1: (0.0, 0.0, -8.0)}, changes=changes)
         z = [float(s.com[0, 2]) for s in frames(apart, prompts, engine="rigid", gravity=0.0, steps=9, material=given)]
         speeds[name] = (z[8] - z[7]) / DT

@@ -14,6 +14,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.physics import solid_surface
+from stages.core.physics.materials import MATERIALS
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
@@ -22,7 +23,7 @@ from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.rigid import MAX_PASSES, REST_SPEED, _World
-from stages.simulate.rigid_model import OMEGA
+from stages.simulate.rigid_model import OMEGA, restitution
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
 
@@ -99,8 +100,14 @@ def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
     t = roll(tmp_path, BALL, loss=loss, lift=("0.5",), dt=0.01, steps=70)
     z = t.com[:, 0, 2] - 0.1
     hit = int((z < 0.02).nonzero()[0])
-    restitution = math.sqrt(float(z[hit:].max()) / 0.5)
-    assert restitution == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
+    rebound = math.sqrt(float(z[hit:].max()) / 0.5)
+    assert rebound == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
+
+
+@pytest.mark.parametrize(("name", "share"), [("steel", 0.597), ("glass", 0.658), ("wood", 0.603), ("plastic", 0.688)])
+def test_stiff_solids_rebound_as_measured(name, share):
+    """Balls dropped from .92 m (The Physics Factbook, Coefficients of restitution)."""
+    assert restitution(MATERIALS[name].loss) == pytest.approx(share, abs=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])

@@ -1,6 +1,7 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
 import gc
+import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,6 +34,9 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
     gc.enable()
+    for logger in logging.root.manager.loggerDict.values():  # pytest gives its handlers to each that does not, six times
+        if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):  # a test; PyTorch has seventy
+            logger.propagate = True
 
 
 def pytest_collection_modifyitems(items) -> None:

@@ -18,10 +18,15 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m compileall -q -j 0 ngff_cli stages
 	touch $@
 
+# importing the tests once compiles what they use: workers that start together would each do so
+$(VENV)/.collected: $(VENV)/.installed
+	$(PYTEST) --collect-only -q -m "not slow" > /dev/null
+	touch $@
+
 demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
-test: setup
+test: $(VENV)/.collected
 	$(PYTEST) -n $(WORKERS) -m "not slow"
 
 test-slow: setup

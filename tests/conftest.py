@@ -34,8 +34,9 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
     gc.enable()
-    for logger in logging.root.manager.loggerDict.values():  # pytest gives its handlers to each that does not, six times
-        if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):  # a test; PyTorch has seventy
+    # in each test pytest gives its handlers to all loggers that do not propagate, of which PyTorch has seventy
+    for name, logger in logging.root.manager.loggerDict.items():
+        if name.startswith("torch") and isinstance(logger, logging.Logger):
             logger.propagate = True
 
 

@@ -25,7 +25,7 @@ from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, as_json, fitted
 from stages.lab.fit.problem import pose_problem
-from stages.simulate.options import ENGINES, SimulateOptions
+from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 KEYPOINTS, STEPS = 32, 50
 REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # largest error of identifiable parameters
@@ -95,7 +95,8 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
     """Errors of the parameters, and of another motion predicted with fitted and with default materials."""
     scene = Run(case.things).scene()
     keypoints = choose_keypoints(scene, KEYPOINTS)
-    simulate = SimulateOptions(engine=case.engine, quality="draft", steps=STEPS, keypoints=KEYPOINTS,
+    contact = "learned" if case.engine == "ngff" else AUTO
+    simulate = SimulateOptions(engine=case.engine, contact=contact, quality="draft", steps=STEPS, keypoints=KEYPOINTS,
                                device=options.device)  # fmt: skip
     rng = torch.Generator().manual_seed(options.seed)
     x = _motion(scene, keypoints, case.seen, case.materials, simulate)

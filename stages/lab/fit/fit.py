@@ -178,7 +178,8 @@ def _text(fit: Fit, k: int, p: Parameter) -> str:
 
 def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:
     """The command that repeats the motion."""
-    words = [f"--engine {fit.problem.options.engine}", f"--materials {out}"]
+    contact = ["--contact learned"] if fit.problem.options.engine == "ngff" else []
+    words = [f"--engine {fit.problem.options.engine}", *contact, f"--materials {out}"]
     words += [f'--velocity "object={i} {",".join(f"{c:.4g}" for c in v)}"' for i, v in velocity.items()]
     words += [f"--lift {i}={height:.4g}" for i, height in fit.problem.prompts.lift.items()]
     return f"ngff simulate {scene} {' '.join(words)}"

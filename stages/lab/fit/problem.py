@@ -178,6 +178,8 @@ def pose_problem(
     if simulate.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {simulate.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     simulate = with_engine(simulate, scene, choose_keypoints(scene, options.keypoints, options.seed))
+    if simulate.engine == "ngff":  # its solved contacts know no more of a material than those of the rigid engine
+        simulate = replace(simulate, contact="learned")
     choices = choose_materials(scene.objects, options.material)
     materials = {i: choice.material for i, choice in choices.items()}
     parameters = _parameters(scene, keypoints, frames, prompts, simulate, materials)
@@ -237,7 +239,7 @@ def _parameters(
     Without forces a common factor of all densities changes nothing: the first object's stays.
     """
     parameters: list[Parameter] = []
-    names = RIGID if options.engine == "rigid" or options.contact == "solved" else tuple(QUANTITIES)
+    names = RIGID if options.engine == "rigid" else tuple(QUANTITIES)
     weighed = bool(prompts.forces)
     for o in scene.objects:
         mine = keypoints.object_id == o.id

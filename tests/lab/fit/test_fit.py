@@ -131,6 +131,15 @@ def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
     assert words.endswith(f'--materials {slide / "m.json"} --velocity "object=1 2,0.5,0"')
 
 
+def test_the_learned_engine_is_fitted_with_contacts_that_know_stiffness(slide):
+    """Also of an object that `ngff simulate` would take to be stiff, with solved contacts."""
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, engine="ngff"))
+    assert [p.name for p in problem.parameters] == ["friction", "loss", "E", "x", "y"]
+    fit = Fit(problem, Estimate(np.zeros(5), np.eye(5)), np.zeros(5), (0.0, 0.0), 0, 0.0)
+    words = _command(slide / "scene.ply", slide / "m.json", fit, {})
+    assert "--engine ngff --contact learned --materials" in words
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
 def test_cma_es_comes_nearer_from_far_away(slide, device, monkeypatch):

@@ -2,9 +2,9 @@
 
 Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
 Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
-stays near its initial value, by a normal prior. Derivatives are by central differences about as large as the
-uncertainty, in independent directions: contacts make the motion a rough function of the parameters. Where residuals
-larger than the noise remain, CMA-ES searches the region which the segments before have left.
+stays near its initial value, by a normal prior. Derivatives are by differences about as large as the uncertainty, in
+independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
+noise remain, CMA-ES searches the region which the segments before have left.
 Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
 filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
 """
@@ -34,6 +34,7 @@ SMALLEST_ERROR = 1e-3  # of a residual [tolerances]: the accuracy of the engines
 PRIOR = 1 / 12**0.5  # standard deviation of the prior: that of a uniform distribution over the range
 FIRST, GROWTH = 4, 1.15  # frames of the first segment, and factor from one to the next
 NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)  # differences [standard deviations], in the search and for intervals
+ONE_SIDED = 3.0  # ratio of the changes to both sides above which the smaller one gives a derivative
 STEPS = 6  # iterations of Levenberg and Marquardt's method
 PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative fall of the cost at which a method ends
 SPREADS = (0.5, 1.0, 0.2, 1.5)  # of CMA-ES, in turn [standard deviations]
@@ -221,12 +222,17 @@ def narrowed(
 
 
 def _derivatives(sims: Simulations, frames: int, known: Estimate) -> Float[np.ndarray, "n p"]:
-    """Derivatives of the residuals along the columns of the root, by central differences within the ranges.
+    """Derivatives of the residuals along the columns of the root, by differences within the ranges.
 
-    Differences to one side only are biased by the curvature of the residuals, which is large where pictures are
-    compared: the search then ends beside the minimum, along the parameters that trade against each other.
+    Those to one side only are biased by the curvature of the residuals, which is large where pictures are compared: the
+    search would end beside the minimum, along the parameters that trade against each other. So they are central, but
+    where the motion becomes another one to one side, as after a collision that is missed, and the other side counts.
     """
     ends = [np.clip(known.x + step, 0, 1) for column in NEAR[0] * known.root.T for step in (column, -column)]
-    moved = np.nan_to_num(np.array(sims.residuals(ends, frames)))
-    lengths = np.linalg.norm(np.subtract(ends[::2], ends[1::2]), axis=1) / np.linalg.norm(known.root, axis=0)
-    return ((moved[::2] - moved[1::2]) / np.maximum(lengths, 1e-9)[:, None]).T
+    middle, *moved = sims.residuals([known.x, *ends], frames)
+    lengths = np.linalg.norm(np.array(ends) - known.x, axis=1) / np.linalg.norm(known.root, axis=0).repeat(2)
+    signs = np.tile([1.0, -1.0], len(known.x))
+    slopes = np.nan_to_num(np.array(moved) - middle) * (signs / np.maximum(lengths, 1e-9))[:, None]
+    rises = np.where(lengths > NEAR[0] / 2, np.linalg.norm(slopes, axis=1), np.inf).reshape(-1, 2)
+    weight = (rises <= ONE_SIDED * rises.min(1, keepdims=True)).astype(float).reshape(-1, 1)
+    return ((weight * slopes).reshape(len(known.x), 2, -1).sum(1) / weight.reshape(-1, 2).sum(1, keepdims=True)).T

@@ -18,15 +18,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m compileall -q -j 0 ngff_cli stages
 	touch $@
 
-# importing the tests once compiles what they use: workers that start together would each do so
-$(VENV)/.collected: $(VENV)/.installed
-	$(PYTEST) --collect-only -q -m "not slow" > /dev/null
-	touch $@
-
 demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
-test: $(VENV)/.collected
+test: setup
 	$(PYTEST) -n $(WORKERS) -m "not slow"
 
 test-slow: setup

@@ -16,7 +16,7 @@ from typing import Any, get_type_hints
 
 import jaxtyping
 
-FIRST, EVERY = 2, 40  # calls
+FIRST, EVERY = 3, 20  # calls
 calls: Counter[int] = Counter()  # in this test, by the address of the code, whose own hash is slow
 made: Counter[int] = Counter()  # functions within functions, in this test
 check_all = jaxtyping.jaxtyped

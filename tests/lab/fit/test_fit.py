@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from stages.lab.fit.fit import Fit, _command, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
-from stages.lab.fit.search import PRIOR, Estimate, _evolve, descend, narrowed, simulations
+from stages.lab.fit.search import PRIOR, Estimate, _derivatives, _evolve, descend, narrowed, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner
@@ -194,3 +195,15 @@ def test_parameters_that_act_together_keep_their_sum():
     assert accepted == pytest.approx([0.15, 0.55], abs=0.002)  # both at 0.15 would be wrong
     alone = Estimate(found.x, np.diag([0.2, 0.01]))
     assert with_initial(alone, np.array([0.15, 0.15]), [0]) == pytest.approx([0.15, 0.4])
+
+
+@pytest.mark.parametrize("residual", [
+    lambda d: d + 2 * d**2,  # curved: central, without the bias of one side
+    lambda d: d + 100 * max(d, 0.0),  # another motion above: the slope of the other side
+    lambda d: d - 100 * max(-d, 0.0),  # and below
+])  # fmt: skip
+def test_derivatives_are_central_but_for_a_side_with_another_motion(residual):
+    step = 0.1
+    sims = SimpleNamespace(residuals=lambda points, frames: [np.array([residual(float(x[0]) - 0.5)]) for x in points])
+    found = float(_derivatives(sims, 1, Estimate(np.array([0.5]), np.array([[step]])))[0, 0])
+    assert found == pytest.approx(step, rel=1e-6)  # per unit of the root

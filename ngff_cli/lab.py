@@ -97,6 +97,13 @@ def fit(
         list[str],
         Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine them; repeatable"),
     ] = [],  # noqa: B006
+    align: Annotated[
+        bool,
+        Option("--align", help="the track has another frame of reference: align it by shared cameras or objects"),
+    ] = MaterialFitOptions.align,
+    rest: Annotated[
+        bool, Option(help="objects of a scene of photos are at rest until something disturbs them")
+    ] = MaterialFitOptions.rest,
     keypoints: Annotated[int, Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
     frames: Annotated[int, Option(help="frames of the motion; 0: all")] = MaterialFitOptions.frames,
     resolution: Annotated[
@@ -121,9 +128,9 @@ def fit(
     from stages.lab.fit.fit import run
 
     options = MaterialFitOptions(
-        engine=engine, quality=quality, material=tuple(material), keypoints=keypoints, frames=frames,
-        resolution=resolution, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers, seed=seed,
-        device=device,
+        engine=engine, quality=quality, material=tuple(material), align=align, rest=rest, keypoints=keypoints,
+        frames=frames, resolution=resolution, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers,
+        seed=seed, device=device,
     )  # fmt: skip
     for line in run(scene, motion, out, options):
         print(line)

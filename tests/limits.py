@@ -1,6 +1,7 @@
 """Limits: of the sizes of files, as on a full disk, and of the values of options."""
 
 import resource
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -11,13 +12,18 @@ from stages.core.errors import InputError
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """No file may exceed `size` bytes, which a program notices like a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    """No file may exceed `size` bytes, which a program notices like a full disk.
+
+    No bytecode is written meanwhile: Python before 3.12.8 would keep what fits of it, which can never be imported.
+    """
+    (soft, hard), wrote = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    sys.dont_write_bytecode = True
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        sys.dont_write_bytecode = wrote
 
 
 def check_limits(options: type, name: str, accepted: Iterable, refused: Iterable) -> None:

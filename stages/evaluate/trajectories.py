@@ -106,12 +106,17 @@ def _with_plausibility(result: Result, measures: dict, ids: list[int]) -> Result
 
 
 def _track(trajectory: Trajectory) -> Track:
-    """Keypoints of a trajectory; objects without keypoints are left out."""
+    keypoints = trajectory.keypoints
+    frame = trajectory_reference_frame(trajectory)
+    return Track(frame, trajectory.info.dt, keypoints.object_id, keypoints.rest, trajectory.positions)
+
+
+def trajectory_reference_frame(trajectory: Trajectory) -> ReferenceFrame:
+    """Cameras of a trajectory and keypoints of its objects; objects without keypoints are left out."""
     keypoints = trajectory.keypoints
     points = {o.id: keypoints.rest[keypoints.object_id == o.id] for o in trajectory.scene.objects}
     objects = tuple(o for o in trajectory.scene.objects if len(points[o.id]))
-    frame = ReferenceFrame(str(trajectory.path), trajectory.scene.cameras, objects, points)
-    return Track(frame, trajectory.info.dt, keypoints.object_id, keypoints.rest, trajectory.positions)
+    return ReferenceFrame(str(trajectory.path), trajectory.scene.cameras, objects, points)
 
 
 def _result(motion: MatchedMotion, fps: float, min_motion: float, notes: list[str]) -> Result:

@@ -67,6 +67,7 @@ def work(command: str, words: list[str], folder: Path, largest: int, more: int) 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background of a shell ignore it
     small = {"gaussians": 1000, "iterations": 5}
     QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
+    sys.dont_write_bytecode = True  # of which Python before 3.12.8 would keep what fits
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     shrink_process()
     if more != NO_LIMIT:

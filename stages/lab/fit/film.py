@@ -156,6 +156,7 @@ def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOp
     """
     world = read_scene(scene)
     check_objects(world, scene)
+    options = replace(options, rest=False)  # films begin as objects are released
     recordings = by_camera(world, scene, films)
     timed = world.sequence is None  # otherwise starts are estimates, which are corrected
     world = replace(world, sequence=timing(world, scene, recordings, options.frames))

@@ -72,6 +72,8 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
     kinds = [format_of(path, "trajectory", "video").kind for path in motion]
     if kinds.count("trajectory") and len(kinds) > 1:
         raise InputError(f"{motion[kinds.index('trajectory')]}: a track is fitted alone; give it, or films")
+    if options.align and kinds != ["trajectory"]:
+        raise InputError("--align: films are of the scene's own cameras; only a track can be aligned with it")
     if kinds == ["trajectory"]:
         problem = read_problem(scene, motion[0], options)
     else:
@@ -178,8 +180,9 @@ def _text(fit: Fit, k: int, p: Parameter) -> str:
 
 def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:
     """The command that repeats the motion."""
-    contact = ["--contact learned"] if fit.problem.options.engine == "ngff" else []
-    words = [f"--engine {fit.problem.options.engine}", *contact, f"--materials {out}"]
+    options = fit.problem.options
+    contact, rest = ["--contact learned"] * (options.engine == "ngff"), ["--no-rest"] * (not options.rest)
+    words = [f"--engine {options.engine}", *contact, *rest, f"--materials {out}"]
     words += [f'--velocity "object={i} {",".join(f"{c:.4g}" for c in v)}"' for i, v in velocity.items()]
     words += [f"--lift {i}={height:.4g}" for i, height in fit.problem.prompts.lift.items()]
     return f"ngff simulate {scene} {' '.join(words)}"

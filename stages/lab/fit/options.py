@@ -13,6 +13,8 @@ class MaterialFitOptions:
     engine: str = "auto"
     quality: str = "draft"  # of the MPM engine
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL: initial values, kept where not identifiable
+    align: bool = False  # the track is in another frame of reference than the scene
+    rest: bool = True  # as that of `ngff simulate`: objects of photos are held until something disturbs them
     keypoints: int = 48  # of the track that are compared, for each object
     frames: int = 0  # of the motion; 0: all
     resolution: int = 320  # longest side to which films are reduced [px]

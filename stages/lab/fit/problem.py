@@ -24,6 +24,7 @@ from stages.core.physics.recording import read_prompts_file
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
+from stages.lab.fit.alignment import aligned
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import (
     AXES,
@@ -150,6 +151,9 @@ class Problem:
 def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Problem:
     """Pose the problem of a scene file and a trajectory file. Raises InputError where they do not fit each other."""
     truth, world = read_trajectory(track), read_scene(scene)
+    if options.align:
+        truth = aligned(truth, world, scene)
+        return pose_problem(world, truth, ForcePrompts(()), options, str(track))
     return pose_problem(world, truth, read_prompts_file(track, scene.stem, world.objects), options, str(track))
 
 
@@ -173,7 +177,7 @@ def pose_problem(
     simulate = SimulateOptions(
         steps=len(frames), dt=truth.info.dt, engine=options.engine, quality=options.quality, seed=options.seed,
         gravity=-truth.info.gravity[2] * scene.metres_per_unit, material=options.material, device=options.device,
-        keypoints=options.keypoints,
+        keypoints=options.keypoints, rest=options.rest,
     )  # fmt: skip
     if simulate.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {simulate.engine}: choose from {', '.join((AUTO, *ENGINES))}")

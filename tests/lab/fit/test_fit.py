@@ -11,20 +11,23 @@ import torch
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import Material, choose_materials
+from stages.core.scene.scene import SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.physics_experiments import Run, ball, block
 from stages.lab.fit import search
-from stages.lab.fit.fit import Fit, _command, solve, with_initial
+from stages.lab.fit.alignment import aligned
+from stages.lab.fit.fit import Fit, _command, run, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
 from stages.lab.fit.search import PRIOR, Estimate, _derivatives, _evolve, descend, narrowed, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
-from tests.conftest import CliRunner
+from tests.conftest import CliRunner, ring
 
 NOISE = 0.002  # of the tracks [m]
 TRUTH = {"E": 1e7, "density": 540.0, "friction": 0.3, "loss": 0.35}
@@ -165,6 +168,37 @@ def test_tracks_that_do_not_fit_the_scene_are_refused(slide):
         pose_problem(scene, replace(truth, positions=truth.positions[:1].expand(len(truth), -1, -1)), nothing, OPTIONS)
     with pytest.raises(InputError, match="three or more"):
         pose_problem(scene, truth, nothing, replace(OPTIONS, frames=2))
+
+
+def test_a_track_in_another_frame_is_aligned(slide):
+    """By cameras with the same names; scales, directions, ids and names of objects differ."""
+    scene, truth = read_scene(slide / "scene.ply"), read_trajectory(slide / "track.h5")
+    turned = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    cameras, away = ring(count=3), Similarity(2.0, turned, torch.ones(3))
+    gaussians = replace(scene.gaussians, object_id=5 * scene.gaussians.object_id)
+    scene = replace(scene, cameras=cameras, gaussians=gaussians, objects=(SceneObject(5, "brick"),))
+    moved = replace(
+        truth, scene=replace(truth.scene, cameras=cameras.transformed(away)), positions=away(truth.positions),
+        keypoints=replace(truth.keypoints, rest=away(truth.keypoints.rest)),
+        info=replace(truth.info, gravity=(0.0, 0.0, -2 * 9.81)),
+    )  # fmt: skip
+    found = aligned(moved, scene, slide / "scene.ply")
+    assert found.keypoints.object_id.unique().tolist() == [5]
+    torch.testing.assert_close(found.positions, truth.positions, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.keypoints.rest, truth.keypoints.rest, atol=1e-5, rtol=0)
+    assert found.info.gravity == pytest.approx((0, 0, -9.81), abs=1e-5)
+
+
+def test_a_track_with_prompts_of_another_frame_is_refused(bounce):
+    """But for start velocities, which are fitted."""
+    scene, track = replace(read_scene(bounce / "scene.ply"), cameras=ring()), read_trajectory(bounce / "track.h5")
+    with pytest.raises(InputError, match="without --align"):
+        aligned(track, scene, bounce / "scene.ply")
+
+
+def test_films_are_not_aligned(slide):
+    with pytest.raises(InputError, match="only a track can be aligned"):
+        run(slide / "scene.ply", [slide / "film.mp4"], slide / "m.json", replace(OPTIONS, align=True))
 
 
 def test_parameters_become_materials_and_velocities():

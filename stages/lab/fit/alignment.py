@@ -1,0 +1,42 @@
+"""A track in another frame of reference than the scene, brought into that of the scene."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from stages.core.errors import InputError
+from stages.core.physics.recording import read_prompts_file
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints, Trajectory
+from stages.evaluate.align import find_alignment
+from stages.evaluate.matching import match_objects
+from stages.evaluate.scenes import scene_reference_frame
+from stages.evaluate.trajectories import trajectory_reference_frame
+
+log = logging.getLogger(__name__)
+
+
+def aligned(track: Trajectory, scene: Scene, file: Path) -> Trajectory:
+    """The track with positions, gravity and ids of objects as the scene of a file has them.
+
+    Cameras and objects are matched as by `ngff evaluate --align`. Raises InputError where they cannot be, and for a
+    track with forces, pins or lifts, which are in the frame of the track.
+    """
+    prompts = read_prompts_file(track.path, file.stem, track.scene.objects)
+    if replace(prompts, velocity={}):  # which is fitted
+        raise InputError(f"{track.path}: it has prompts, whose objects and directions are not those of {file}; fit the "
+                         "scene that they are about, without --align")  # fmt: skip
+    predicted, true = scene_reference_frame(file, scene), trajectory_reference_frame(track)
+    similarity, how = find_alignment(predicted, true)
+    pairs, matched = match_objects(predicted.transformed(similarity), true, [])
+    log.info("%s; scale %.4g; %s", how, similarity.scale, matched)
+    to_scene, ids = similarity.inverse(), {b.id: a.id for a, b in pairs}
+    keypoints, info = track.keypoints, track.info
+    object_id = torch.tensor([ids[int(i)] for i in keypoints.object_id], dtype=keypoints.object_id.dtype)
+    gravity = tuple((to_scene.scale * to_scene.rotation @ torch.tensor(info.gravity).float()).tolist())
+    return replace(track, keypoints=Keypoints(to_scene(keypoints.rest), object_id),
+                   positions=to_scene(track.positions), info=replace(info, gravity=gravity))  # fmt: skip

@@ -40,7 +40,6 @@ from stages.core.perception.table_outline import TableOutline
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, MaterialChoice
 from stages.core.physics.rigid_shapes import rigid_shapes
-from stages.core.physics.solid_surface import solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -60,7 +59,7 @@ from stages.simulate.setup import (
     set_up_scene,
     table_of,
 )
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, object_shape
 from stages.simulate.table_edges import TableEdges
 
 log = logging.getLogger(__name__)
@@ -250,9 +249,8 @@ class _World:
             if b.shape.ball is not None:
                 return ball_shape(scale * (b.shape.ball.centre - b.shape.com.double().numpy()),
                                   scale * b.shape.ball.radius)  # fmt: skip
-            surface = solid_surface(self._scene, self._ids[row], options.seed)
-            ground = b.ground / self._scene.metres_per_unit
-            return surface_shape(surface, ground, b.shape.com.double().numpy(), scale, b.shape.convex)
+            ground, com = b.ground / self._scene.metres_per_unit, tuple(b.shape.com.tolist())
+            return object_shape(self._scene, self._ids[row], options.seed, ground, com, scale, b.shape.convex)
 
         return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self._bodies))))
 

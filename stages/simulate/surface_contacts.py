@@ -25,7 +25,9 @@ from scipy.spatial import ConvexHull, QhullError
 from stages.core.geometry.extremes import fibonacci
 from stages.core.geometry.surface_faces import nearest_points, surface_faces
 from stages.core.kernels.depth_lookup import Samples, depth_lookup, turned
-from stages.core.physics.solid_surface import SolidSurface
+from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.scene.cached import cached_in_scene
+from stages.core.scene.scene import Scene
 from stages.simulate.initial_overlaps import AllowedOverlaps
 
 FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
@@ -52,6 +54,14 @@ class SurfaceShape:
     convex: bool  # fills its convex hull
     radius: float = 0.0  # of a ball
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of a ball
+
+
+@cached_in_scene
+def object_shape(
+    scene: Scene, object_id: int, seed: int, bottom: float, com: tuple[float, ...], scale: float, convex: bool
+) -> SurfaceShape:
+    """The `surface_shape` of the body of an object. Raises InputError for one without any usable Gaussian."""
+    return surface_shape(solid_surface(scene, object_id, seed), bottom, np.array(com), scale, convex)
 
 
 def surface_shape(body: SolidSurface, bottom: float, com: np.ndarray, scale: float, convex: bool) -> SurfaceShape:
@@ -261,14 +271,15 @@ class SurfaceContacts:
         count = len(self._radius)
         at, turn = data.xpos[1 : count + 1], data.xmat[1 : count + 1].reshape(-1, 3, 3)
         middle = (data.geom_xpos[self._planes] * normal).sum(1) - at @ normal.T + self._apart
-        low = np.flatnonzero((middle + self._radius[:, None] > 0).any(1) & ~fixed)
-        row, _ = _ranges(self._first_corner[low], self._first_corner[low + 1])
-        of = self._corner_of[row]
-        corners, down = self._corners[row], normal @ turn
-        along = np.stack([np.einsum("ki,ki->k", corners, down[of, p]) for p in range(len(normal))], 1)
-        depth = middle[of] - along
-        k, plane = np.nonzero(depth > 0)
-        return row[k], plane, depth[k, plane]
+        low = np.argwhere((middle + self._radius[:, None] > 0) & ~fixed[:, None])
+        out = [(NONE[0], NONE[0], NONE[1])]
+        for i, p in low:
+            begin, end = self._first_corner[i : i + 2]
+            depth = middle[i, p] - self._corners[begin:end] @ (normal[p] @ turn[i])
+            k = np.flatnonzero(depth > 0)
+            if len(k):
+                out.append((begin + k, np.full(len(k), p), depth[k]))
+        return tuple(np.concatenate(each) for each in zip(*out, strict=True))
 
 
 def add_contacts(mujoco, model, data, x, normal, excess, one, two) -> None:

@@ -58,19 +58,25 @@ def rigid_shapes(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[R
     What lies below the height `bottom` is cut off. Raises InputError for an object without any usable Gaussian.
     """
     solids, found = _solids(scene, seed, bottom), balls(scene, seed, bottom)
-    return [_shape(solid, seed) if ball is None else _ball_shape(ball)
-            for solid, ball in zip(solids, found, strict=True)]  # fmt: skip
+
+    def shape(row: int) -> RigidShape:
+        ball = found[row]
+        return _shape(solids[row], seed) if ball is None else _ball_shape(ball)
+
+    return parallel_map(shape, range(len(solids)))
 
 
 @cached_in_scene
 def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | None]:
     """The balls among the objects, in the order of scene.objects; arguments and errors as those of `rigid_shapes`."""
-    solids, out = _solids(scene, seed, bottom), []
-    for row, solid in enumerate(solids):
-        ball = fitted_ball(solid.surface, bottom, all_seen=scene.cameras is None)
+    solids = _solids(scene, seed, bottom)
+
+    def fitted(row: int) -> Ball | None:
+        ball = fitted_ball(solids[row].surface, bottom, all_seen=scene.cameras is None)
         clear = ball is not None and ball.clear_of(_around(solids, row, DENT * ball.radius))
-        out.append(ball if clear else None)
-    return out
+        return ball if clear else None
+
+    return parallel_map(fitted, range(len(solids)))
 
 
 @cached_in_scene
@@ -125,8 +131,11 @@ def _shape(solid: Solid, seed: int) -> RigidShape:
 
 def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
     """The convex hull of its points, if it fills that."""
-    hull = _hull(points)
-    return hull if hull is not None and hull.volume * CONVEX < solid.moments[0] else None
+    for some in (_extreme(points), points):  # the hull of some is smaller, and found in no time
+        hull = _hull(some)
+        if hull is None or hull.volume * CONVEX >= solid.moments[0]:
+            return None
+    return hull
 
 
 def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:

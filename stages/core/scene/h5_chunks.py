@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import h5py
@@ -29,7 +30,9 @@ def write_compressed(file: h5py.File, name: str, values: np.ndarray) -> None:
         return
     data = file.create_dataset(name, values.shape, values.dtype, chunks=(rows, *values.shape[1:]), **COMPRESSED)
     padded = np.concatenate([values, np.zeros((-len(values) % rows, *values.shape[1:]), values.dtype)])
-    _write_chunks(data, 0, np.split(padded, len(padded) // rows))
+    # parameters of Gaussians hardly repeat: without strings they are 3 % larger, in .4 of the time
+    strategy = zlib.Z_RLE if values.dtype.kind == "f" else zlib.Z_DEFAULT_STRATEGY
+    _write_chunks(data, 0, np.split(padded, len(padded) // rows), strategy)
 
 
 def append_rows(data: h5py.Dataset, rows: np.ndarray) -> None:
@@ -58,15 +61,19 @@ def read_compressed(data: h5py.Dataset) -> np.ndarray:
     return out
 
 
-def _write_chunks(data: h5py.Dataset, first: int, chunks: list[np.ndarray]) -> None:
+def _write_chunks(
+    data: h5py.Dataset, first: int, chunks: list[np.ndarray], strategy: int = zlib.Z_DEFAULT_STRATEGY
+) -> None:
     zeros = (0,) * (data.ndim - 1)
-    for i, chunk in enumerate(_in_threads(_encoded, chunks)):
+    for i, chunk in enumerate(_in_threads(partial(_encoded, strategy=strategy), chunks)):
         data.id.write_direct_chunk((first + i * data.chunks[0], *zeros), chunk)
 
 
-def _encoded(values: np.ndarray) -> bytes:
-    """A chunk as stored."""
-    return zlib.compress(np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T.tobytes(), LEVEL)
+def _encoded(values: np.ndarray, strategy: int) -> bytes:
+    """A chunk as stored, by a strategy of zlib."""
+    shuffled = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
+    encoder = zlib.compressobj(LEVEL, strategy=strategy)
+    return encoder.compress(shuffled) + encoder.flush()
 
 
 def _decoded(stored: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:

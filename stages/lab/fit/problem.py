@@ -264,14 +264,17 @@ def _first_velocity(
 ) -> dict[str, float]:
     """A guess of the start velocity of an object by axis [scene units/s], from the first frames of its middle.
 
-    Nothing for one that is released from rest, and no vertical velocity of one that is supported.
+    Nothing for one that is released from rest, and no vertical velocity of one that is supported: whose height is
+    constant, or is nearer to that than to free flight, as of one that settles.
     """
     first = centre[: FIRST_FRAMES + 1]
     t = options.dt * torch.arange(len(first))
     fall = options.gravity / scene.metres_per_unit * t**2 / 2  # of an unsupported object
-    supported = bool(((first[:, 2] - first[0, 2]).abs() < still).all())
-    path = first - first[0] + (0.0 if supported else 1.0) * fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    velocity = (t[:, None] * path).sum(0) / t.square().sum()
-    if float(path.norm(dim=1).max()) < still:
+    path = first - first[0]
+    flight = path + fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    velocity = (t[:, None] * flight).sum(0) / t.square().sum()
+    off = (flight[:, 2] - velocity[2] * t).norm()
+    supported = bool((path[:, 2].abs() < still).all() or path[:, 2].norm() < off)
+    if float((path[:, :2] if supported else flight).norm(dim=1).max()) < still:
         return {}
     return dict(zip(AXES[: 2 if supported else 3], velocity.tolist(), strict=False))

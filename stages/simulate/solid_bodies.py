@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.kernels.threads import parallel_map
 from stages.core.physics.particles import inliers, usable
 from stages.core.physics.signed_distance import distance_grid, mass_properties
 from stages.core.scene.cached import cached_in_scene
@@ -31,16 +32,17 @@ def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidB
 
     They are computed on `device`.
     """
-    out = []
     g = scene.gaussians.to("cpu")
     good = usable(g)
-    for o in scene.objects:
-        mine = (g.object_id == o.id) & g.means.isfinite().all(1)
+
+    def body(object_id: int) -> SolidBody:
+        mine = (g.object_id == object_id) & g.means.isfinite().all(1)
         surface = g.means[mine & good] if bool((mine & good).any()) else g.means[mine]
         grid = distance_grid(surface[inliers(surface)].to(device), sheet)
         volume, centre, inertia = mass_properties(grid)
-        out.append(SolidBody(volume, centre.cpu(), inertia.cpu()))
-    return out
+        return SolidBody(volume, centre.cpu(), inertia.cpu())
+
+    return parallel_map(body, [o.id for o in scene.objects])
 
 
 def mass_fractions(points: Float[Tensor, "k 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "k"]:

@@ -12,7 +12,7 @@ are in the unit of the Gaussians.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -103,8 +103,15 @@ def usable(g: Gaussians) -> Tensor:
 @cached_in_scene
 def usable_means(scene: Scene, object_id: int) -> Float[Tensor, "n 3"]:
     """Centres of an object's usable Gaussians, on the CPU."""
-    mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
-    return mine.means[usable(mine)]
+    return _usable(scene, object_id).means
+
+
+@cached_in_scene
+def _usable(scene: Scene, object_id: int) -> Gaussians:
+    """An object's usable Gaussians, on the CPU, without colours."""
+    g = scene.gaussians
+    g = replace(g, sh=g.sh[:, :0])[g.object_id == object_id].to("cpu")
+    return g[usable(g)]
 
 
 def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
@@ -112,10 +119,10 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
 
     Raises InputError for an object without any usable Gaussian.
     """
-    mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
-    good = mine[usable(mine)]
+    good = _usable(scene, object_id)
     if not len(good):  # fall back to the bare centres
-        means = mine.means[mine.means.isfinite().all(1)]
+        mine = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu()
+        means = mine[mine.isfinite().all(1)]
         if not len(means):
             raise InputError(
                 f"object {object_id} ({scene.name_of(object_id)}): none of its {len(mine)} Gaussians is usable "

@@ -3,20 +3,8 @@
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
 
-A contact reverses the speed of approach, times the restitution, within a substep (Newton's law of impact); that follows
-from the larger loss factor of both materials. Below REST_SPEED nothing rebounds, since stacks that rebound at any speed
-never come to rest: critically damped springs then push bodies apart, at no more than that speed, since a body that
-meets an edge may be deep inside at once. Their frequency is the highest that the substep resolves, so that resting
-bodies sink in by less than 1e-3 of the smallest object. Impacts that would give energy to bodies do not rebound. The
-friction of a pair is the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the
-contact slows down as they roll.
-Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
-it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
-convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives
-them energy. So that speed, known from the previous pass, is subtracted and the forces are solved for again.
-Sources: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; exact friction from
-the relaxed one: De Saxce and Feng 1998, "The bipotential method"; Le Lidec et al. 2024, "Contact models in robotics".
-
+Contacts rebound and have exact Coulomb friction (`contact_forces.py`); that of a pair is the larger coefficient, as in
+the other engines. Round bodies are balls, which a loss of energy in the contact slows down as they roll.
 Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
 (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
 is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.
@@ -45,11 +33,12 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.background import background_boxes
 from stages.simulate.changes import changed_options, changed_pins
+from stages.simulate.contact_forces import find_contact_forces
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
-from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model, restitution
+from stages.simulate.rigid_model import SUBSTEPS, Body, Units, mujoco_model, restitution
 from stages.simulate.setup import (
     SceneSetup,
     check_motion,
@@ -63,9 +52,6 @@ from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball
 from stages.simulate.table_edges import TableEdges
 
 log = logging.getLogger(__name__)
-REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
-MAX_PASSES = 8  # of the solver for exact friction; in each the error of a sliding box shrinks by mu^2 / (1 + mu^2)
-SLIP_TOLERANCE = 0.01  # error of a contact's normal acceleration with which they end, relative to gravity plus itself
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
@@ -337,61 +323,9 @@ class _World:
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         if data.nefc:
-            self._find_contact_forces()
+            find_contact_forces(mujoco, model, data, self._restitution)
         else:
             mujoco.mj_fwdConstraint(model, data)
-
-    def _find_contact_forces(self) -> None:
-        """Where contacts would give energy to the bodies that they connect, none of them rebounds.
-
-        Newton's law of impact may do so where bodies are hit at several points at once.
-        """
-        data, timestep = self.data, self.model.opt.timestep
-        normal, friction, rebounds = self._set_references()
-        wanted = data.efc_aref[normal]
-        self._solve(normal, friction)
-        if not rebounds.any():
-            return
-        work = data.qfrc_constraint * (data.qvel + data.qacc * timestep / 2)
-        of_island = np.bincount(data.dof_island + 1, work)  # the first is that of bodies without contacts
-        stopped = rebounds & (of_island[data.efc_island[normal] + 1] > 0)
-        if stopped.any():
-            data.efc_aref[normal] = np.where(stopped, -data.efc_vel[normal] / timestep, wanted)
-            self._solve(normal, friction)
-
-    def _set_references(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Let contacts rebound within a substep, push slow ones apart, and let friction stop slip within a substep.
-
-        Returns the constraint rows (k,) of the contacts' normals, friction coefficients (k,), and which (k,) rebound.
-        """
-        data, timestep = self.data, self.model.opt.timestep
-        active = data.contact.efc_address >= 0
-        normal = data.contact.efc_address[active]
-        speed = data.efc_vel[normal]
-        push = np.minimum(-(OMEGA**2) * data.efc_pos[normal], 2 * OMEGA * REST_SPEED) - 2 * OMEGA * speed
-        share = (-speed / REST_SPEED - 1).clip(0, 1)  # of twice that speed or more all of them rebounds
-        rebound = share * self._restitution[data.contact.geom[active]].min(1) * -speed
-        data.efc_aref[normal] = np.where(rebound > 0, (rebound - speed) / timestep, push)
-        along = normal[:, None] + [1, 2]
-        data.efc_aref[along] = -data.efc_vel[along] / timestep
-        return normal, data.contact.friction[active, 0], rebound > 0
-
-    def _solve(self, normal: np.ndarray, friction: np.ndarray) -> None:
-        """Find the contact forces with exact Coulomb friction, by passes that know the slip after the previous one."""
-        mujoco, model, data = self._mujoco, self.model, self.data
-        along, wanted = normal[:, None] + [1, 2], data.efc_aref[normal]
-        slip = np.linalg.norm(data.efc_aref[along], axis=1)  # after the substep, divided by it
-        slip = np.maximum(slip - friction * np.maximum(wanted + 1, 0), 0)  # a box that slides with this normal force
-        rate = np.zeros(data.nefc)
-        for _ in range(MAX_PASSES):
-            data.efc_aref[normal] = wanted - friction * slip
-            mujoco.mj_fwdConstraint(model, data)
-            mujoco.mj_mulJacVec(model, data, rate, data.qacc)
-            before, slip = slip, np.linalg.norm(rate[along] - data.efc_aref[along], axis=1)
-            error = friction * np.abs(slip - before)
-            touching = (data.efc_force[normal] > 0) | (rate[normal] < wanted)
-            if not (touching & (error > SLIP_TOLERANCE * (1 + np.abs(wanted)))).any():
-                break
 
     def _apply_forces(self, acting: list, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""

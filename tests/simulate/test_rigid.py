@@ -21,8 +21,8 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
+from stages.simulate.contact_forces import MAX_PASSES, REST_SPEED, set_references, solve
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
-from stages.simulate.rigid import MAX_PASSES, REST_SPEED, _World
 from stages.simulate.rigid_model import OMEGA, restitution
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
@@ -402,33 +402,31 @@ def contacts_at(speed: list[float], distance: list[float]) -> SimpleNamespace:
 
 def test_fast_contacts_rebound_within_a_substep_and_slow_ones_are_pushed_apart():
     """Deep ones at the speed below which nothing rebounds, however deep; slip ends at once."""
-    world, v = object.__new__(_World), REST_SPEED
-    world.model = SimpleNamespace(opt=SimpleNamespace(timestep=0.01))
-    world._restitution = np.array([1.0, 0.6])
-    world.data = contacts_at([-v, 0.0, v, v, -10 * v, -1.5 * v], [-d for d in (0.0, 1e-5, 1.0, 5.0, 0.0, 0.0)])
-    normal, friction, rebounds = world._set_references()
+    v = REST_SPEED
+    data = contacts_at([-v, 0.0, v, v, -10 * v, -1.5 * v], [-d for d in (0.0, 1e-5, 1.0, 5.0, 0.0, 0.0)])
+    normal, friction, rebounds = set_references(data, 0.01, np.array([1.0, 0.6]))
     assert normal.tolist() == [0, 3, 6, 9, 12, 15] and friction.tolist() == [0.4] * 6
     assert rebounds.tolist() == [False] * 4 + [True] * 2
     expected = [2 * OMEGA * v, OMEGA**2 * 1e-5, 0.0, 0.0, 10 * v * 1.6 / 0.01, 1.5 * v * 1.3 / 0.01]
-    assert world.data.efc_aref[normal] == pytest.approx(expected)
-    assert world.data.efc_aref[normal + 1].tolist() == [-100.0] * 6 and (world.data.efc_aref[normal + 2] == 200.0).all()
+    assert data.efc_aref[normal] == pytest.approx(expected)
+    assert data.efc_aref[normal + 1].tolist() == [-100.0] * 6 and (data.efc_aref[normal + 2] == 200.0).all()
 
 
 @pytest.mark.parametrize(("slips", "passes"), [([3.0] * 9, 2), ([3.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5], 4),
                                                (list(range(1, 10)), MAX_PASSES)])  # fmt: skip
 def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
     """A contact that slides at these speeds after the passes; each takes friction times the last one's slip off."""
-    world, taken = object.__new__(_World), []
+    taken: list[float] = []
 
-    def solve(model, data):
+    def constraint(model, data):
         taken.append(float(data.efc_aref[0]))
 
     def rates(model, data, rate, qacc):
         rate[1:] = 0.6 * slips[len(taken) - 1], 0.8 * slips[len(taken) - 1]
 
-    world._mujoco, world.model = SimpleNamespace(mj_fwdConstraint=solve, mj_mulJacVec=rates), None
-    world.data = SimpleNamespace(efc_aref=np.array([2.0, 0.0, 0.0]), efc_force=np.ones(3), nefc=3, qacc=None)
-    world._solve(np.array([0]), np.array([0.5]))
+    mujoco = SimpleNamespace(mj_fwdConstraint=constraint, mj_mulJacVec=rates)
+    data = SimpleNamespace(efc_aref=np.array([2.0, 0.0, 0.0]), efc_force=np.ones(3), nefc=3, qacc=None)
+    solve(mujoco, None, data, np.array([0]), np.array([0.5]))
     assert taken == pytest.approx([2.0, *(2.0 - 0.5 * s for s in slips[: passes - 1])])
 
 

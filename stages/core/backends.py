@@ -17,6 +17,7 @@ class Backend:
     entry: str  # "module:function"
     help: str  # one line
     find_weights: str = ""  # of a network: "module:function" that returns the path of its published weights
+    network: str = ""  # of a promptable one: "module:function" that loads it, see stages/segment/prompted.py
     package: str = ""  # optional package that it needs
     extra: str = ""  # extra of this project that installs the package
 

@@ -20,8 +20,9 @@ BACKENDS = {
     "points": Backend("stages.segment.points:segment", "the objects at points in photos (--points), by the network"),
     "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
     "sam2": Backend(
-        "stages.segment.sam2:segment", "SAM 2.1: boxes, points or automatic masks, propagated through the photos",
-        find_weights="stages.core.models.sam2.weights:find", package="transformers", extra="sam2",
+        "stages.segment.prompted:segment", "SAM 2.1: boxes, points or automatic masks, propagated through the photos",
+        find_weights="stages.core.models.sam2.weights:find", network="stages.core.models.sam2.weights:load_segmenter",
+        package="transformers", extra="sam2",
     ),
 }  # fmt: skip
 NETWORKS = with_weights(BACKENDS)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 
-from stages.core.backends import pick_device
+from stages.core.backends import load, pick_device
 from stages.core.errors import InputError
 from stages.core.models.promptable import PointPrompts, PromptableSegmenter
 from stages.core.perception.grouping import name_objects
@@ -15,7 +16,7 @@ from stages.core.perception.support import find_support
 from stages.core.perception.voting import apply_votes, collect_votes
 from stages.core.scene.scene import Scene
 from stages.segment.discovery import discover_objects
-from stages.segment.options import SegmentOptions
+from stages.segment.options import BACKENDS, SegmentOptions
 from stages.segment.prompts import ObjectPrompts, read_prompts
 from stages.segment.propagation import MaskTracker
 from stages.segment.view_images import view_images
@@ -23,14 +24,13 @@ from stages.segment.view_images import view_images
 log = logging.getLogger(__name__)
 
 
-def segment_with(
-    load: Callable[[SegmentOptions, str], PromptableSegmenter], scene: Scene, options: SegmentOptions
-) -> Scene:
+def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Objects marked by the prompts in the first view, or, without prompts, the objects on the table.
 
-    `load` returns the network for (options, device); it is called once the inputs have been checked. The network is
-    run on the photos, or, without --photos, on the scene rendered from its cameras. Raises InputError for a scene
-    without cameras and for photos without the one that the prompts refer to.
+    The row of the backend names the function that loads its network from (weights, download, device), which is called
+    once the inputs have been checked. The network is run on the photos, or, without --photos, on the scene rendered
+    from its cameras. Raises InputError for a scene without cameras and for photos without the one that the prompts
+    refer to.
     """
     name = options.backend
     if scene.cameras is None or not len(scene.cameras):
@@ -40,7 +40,8 @@ def segment_with(
     prompts = read_prompts(boxes, scene.cameras, options.undistorted) if boxes is not None else None
     if prompts is not None and images.views[0] != 0:
         raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
-    network = load(options, pick_device(options.device))
+    load_network: Callable[[Path | None, bool, str], PromptableSegmenter] = load(BACKENDS[name].network)
+    network = load_network(options.weights, options.download, pick_device(options.device))
     log.info("%s: %d %s", name, len(images), "photos" if options.photos else "rendered views of the scene: no --photos")
     tracker = MaskTracker(network, scene, images)
     if prompts is not None:

@@ -12,10 +12,9 @@ from stages.core.geometry.cameras import project
 from stages.core.perception.grabcut import clean_mask
 from stages.core.perception.voting import ViewFootprint
 from stages.core.scene.scene import Scene
-from stages.segment import boxes
+from stages.segment import boxes, prompted
 from stages.segment.boxes import MAX_VIEWS, nearest_first, segment, segment_prompted_view
 from stages.segment.options import SegmentOptions
-from stages.segment.prompted import segment_with
 from stages.segment.prompts import read_prompts
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart
@@ -171,7 +170,7 @@ def test_scene_without_cameras_is_refused(tmp_path, backend, cameras):
     (tmp_path / "p.json").write_text('{"bbox": [[1, 1, 5, 5]]}')
     options, scene = SegmentOptions(boxes=tmp_path / "p.json"), Scene(random_gaussians(5), cameras=cameras)
     with pytest.raises(InputError, match="has no cameras"):
-        segment(scene, options) if backend == "boxes" else segment_with(pytest.fail, scene, options)
+        segment(scene, options) if backend == "boxes" else prompted.segment(scene, replace(options, backend="sam2"))
 
 
 def test_ratio_of_colours_is_that_of_their_frequencies():

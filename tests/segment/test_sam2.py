@@ -2,14 +2,15 @@
 
 import json
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.models.sam2 import weights as published
 from stages.core.scene.images import write_png
 from stages.core.scene.scene_ply import read_scene
-from stages.segment import sam2
 from stages.segment.options import SegmentOptions
 from stages.segment.prompted import point_prompts
 from stages.segment.prompts import read_prompts
@@ -97,12 +98,11 @@ def test_missing_weights_are_reported(scene_file, tmp_path, monkeypatch):
 def test_weights_are_downloaded_only_on_request_and_if_missing(weights, tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(sam2, "download", lambda: "fetched")
-    assert sam2._weights(SegmentOptions(backend="sam2", download=True)) == "fetched"
-    given = SegmentOptions(backend="sam2", weights=weights, download=True)
-    assert sam2._weights(given) == weights / "model.safetensors"
+    monkeypatch.setattr(published, "download", lambda: Path("fetched"))
+    assert published.weights_file(None, True) == Path("fetched")
+    assert published.weights_file(weights, True) == weights / "model.safetensors"
     with pytest.raises(InputError, match="no config.json"):
-        sam2._weights(SegmentOptions(backend="sam2", weights=tmp_path, download=True))
+        published.weights_file(tmp_path, True)
 
 
 def test_photos_of_another_aspect_ratio_are_refused(scene_file, truth, weights, photos, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,8 @@ from stages.core.scene.files import must_exist
 
 if TYPE_CHECKING:
     from transformers import Sam2VideoModel
+
+    from stages.core.models.promptable import PromptableSegmenter
 
 SOURCE = HubSource("facebook/sam2.1-hiera-large", "0.9 GB", "Apache-2.0")
 SMALLEST = "facebook/sam2.1-hiera-tiny"  # 0.16 GB and several times faster; every size of SAM 2.1 works
@@ -37,6 +40,32 @@ def find(given: Path | None = None) -> Path:
         f"https://huggingface.co/{SOURCE.repository} ({SOURCE.size}, licence {SOURCE.licence}; {SMALLEST} is faster "
         f"on a CPU) into {places[0]}, name their folder with --weights, or add --download"
     )
+
+
+def load_segmenter(given: Path | None, download_missing: bool, device: str) -> PromptableSegmenter:
+    """The network with the weights that `find` finds, or, with `download_missing`, else downloads.
+
+    Memory: the weights, about 1 GB of activations, one photo, and 20 MB per object, for any number of photos.
+    """
+    return _loaded(weights_file(given, download_missing), device)
+
+
+@lru_cache(maxsize=1)
+def _loaded(path: Path, device: str) -> PromptableSegmenter:
+    model = load(path, device)  # explains the absence of transformers, which the next line imports
+    from stages.core.models.sam2.segmenter import Sam2Segmenter
+
+    return Sam2Segmenter(model)
+
+
+def weights_file(given: Path | None, download_missing: bool) -> Path:
+    """As `find`; downloaded first if that was requested and they are missing, unless they were to be those `given`."""
+    try:
+        return find(given)
+    except InputError:
+        if not download_missing or given is not None:
+            raise
+    return download()
 
 
 def download() -> Path:

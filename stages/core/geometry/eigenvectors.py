@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 BATCH = 1 << 14  # matrices at once: cuSOLVER fails for some hundred thousand, with an internal error or invalid value
+PAIRS = np.array([[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])  # the entries of a symmetric matrix
+FULL = np.array([0, 3, 4, 3, 1, 5, 4, 5, 2])  # which of these are those of the full one
+UNCLEAR = 1e-6  # length of the vectors across rows below which rounding matters [squared size of the matrix]
 
 
 def eigh(matrices: Float[Tensor, "b n n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n n"]]:
@@ -15,3 +19,29 @@ def eigh(matrices: Float[Tensor, "b n n"]) -> tuple[Float[Tensor, "b n"], Float[
         return torch.linalg.eigh(matrices)
     values, vectors = zip(*(torch.linalg.eigh(part) for part in matrices.split(BATCH)), strict=True)
     return torch.cat(values), torch.cat(vectors)
+
+
+def least_directions(matrices: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 3"]:
+    """Unit eigenvectors of the least eigenvalue of symmetric 3 x 3 matrices, given by their entries in PAIRS.
+
+    In closed form, ten times as fast as LAPACK: a vector across two rows of the matrix less that eigenvalue.
+    Source: Smith 1961, "Eigenvalues of a symmetric 3 x 3 matrix".
+    """
+    xx, yy, zz, xy, xz, yz = np.ascontiguousarray(matrices.T)
+    mean = (xx + yy + zz) / 3
+    xx, yy, zz = xx - mean, yy - mean, zz - mean
+    size = np.sqrt((xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    least = 2 * size * np.cos((np.arccos((det / (2 * size**3).clip(1e-300)).clip(-1, 1)) + 2 * np.pi) / 3)
+    xx, yy, zz = xx - least, yy - least, zz - least
+    across = np.array([[xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy],
+                       [yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz],
+                       [yz * xz - zz * xy, zz * xx - xz * xz, xz * xy - yz * xx]])  # fmt: skip
+    length = np.sqrt((across**2).sum(1))
+    best = length.argmax(0)
+    row = np.arange(len(best))
+    length = length[best, row]
+    out = across[best, :, row] / length.clip(1e-300)[:, None]
+    unclear = length <= UNCLEAR * size**2  # both lesser eigenvalues are about equal
+    out[unclear] = np.linalg.eigh(matrices[unclear][:, FULL].reshape(-1, 3, 3))[1][:, :, 0]
+    return out

@@ -24,7 +24,7 @@ from stages.core.scene.scene import Scene
 
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
 MAX_VERTICES = 200  # of a hull: a cylinder or egg is round to 1 %
-SOME = 2000  # points of which the hull tells that an object does not fill that of all
+HULL_SUBSET = 2000  # points of which the hull tells that an object does not fill that of all
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
 
@@ -132,7 +132,10 @@ def _shape(solid: Solid, seed: int) -> RigidShape:
 
 def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
     """The convex hull of its points, if it fills that."""
-    for some in (points[:: -(-len(points) // SOME)], points):  # the hull of some is smaller, and found in no time
+    for some in (
+        points[:: -(-len(points) // HULL_SUBSET)],
+        points,
+    ):  # the hull of some is smaller, and found in no time
         hull = _hull(some)
         if hull is None or hull.volume * CONVEX >= solid.moments[0]:
             return None

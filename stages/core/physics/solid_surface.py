@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from stages.core.geometry.eigenvectors import PAIRS, least_directions
 from stages.core.physics.morphology import surrounded
 from stages.core.physics.particles import filled_voxels, inliers, usable_means
 from stages.core.scene.cached import cached_in_scene
@@ -34,9 +35,6 @@ AT_EDGE = 0.2  # RMS distance of neighbours from the plane of a sample that is a
 FLATTER = 0.5  # ratio of that of a sample beside it, on a face, at most
 ON_PLANE = 0.2  # distance from the plane of that face [spacing of the samples]
 OCTANTS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
-PAIRS = np.array([[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])  # the entries of a symmetric matrix
-FULL = np.array([0, 3, 4, 3, 1, 5, 4, 5, 2])  # which of these are those of the full one
-UNCLEAR = 1e-6  # length of the vectors across rows below which rounding matters [squared size of the matrix]
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -213,33 +211,7 @@ def _planes(points: np.ndarray, squares: np.ndarray, weight: np.ndarray) -> tupl
     """
     total = weight.sum(1, keepdims=True)
     middle, second = ((weight[:, None] @ x)[:, 0] / total for x in (points, squares))
-    return middle, _least_directions(second - middle[:, PAIRS[0]] * middle[:, PAIRS[1]])
-
-
-def _least_directions(matrices: np.ndarray) -> np.ndarray:
-    """Unit eigenvectors (n, 3) of the least eigenvalue of symmetric matrices (n, 6), given by their entries in PAIRS.
-
-    In closed form, ten times as fast as LAPACK: a vector across two rows of the matrix less that eigenvalue.
-    Source: Smith 1961, "Eigenvalues of a symmetric 3 x 3 matrix".
-    """
-    xx, yy, zz, xy, xz, yz = np.ascontiguousarray(matrices.T)
-    mean = (xx + yy + zz) / 3
-    xx, yy, zz = xx - mean, yy - mean, zz - mean
-    size = np.sqrt((xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-    det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    least = 2 * size * np.cos((np.arccos((det / (2 * size**3).clip(1e-300)).clip(-1, 1)) + 2 * np.pi) / 3)
-    xx, yy, zz = xx - least, yy - least, zz - least
-    across = np.array([[xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy],
-                       [yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz],
-                       [yz * xz - zz * xy, zz * xx - xz * xz, xz * xy - yz * xx]])  # fmt: skip
-    length = np.sqrt((across**2).sum(1))
-    best = length.argmax(0)
-    row = np.arange(len(best))
-    length = length[best, row]
-    out = across[best, :, row] / length.clip(1e-300)[:, None]
-    unclear = length <= UNCLEAR * size**2  # both lesser eigenvalues are about equal
-    out[unclear] = np.linalg.eigh(matrices[unclear][:, FULL].reshape(-1, 3, 3))[1][:, :, 0]
-    return out
+    return middle, least_directions(second - middle[:, PAIRS[0]] * middle[:, PAIRS[1]])
 
 
 @cached_in_scene

@@ -1,8 +1,10 @@
 """Eigenvectors of many small symmetric matrices."""
 
+import numpy as np
+import pytest
 import torch
 
-from stages.core.geometry.eigenvectors import BATCH, eigh
+from stages.core.geometry.eigenvectors import BATCH, PAIRS, eigh, least_directions
 
 
 def test_more_matrices_than_the_solver_takes_at_once(device):
@@ -13,3 +15,22 @@ def test_more_matrices_than_the_solver_takes_at_once(device):
     assert (values.diff(dim=1) >= 0).all()
     torch.testing.assert_close(A @ vectors, vectors * values[:, None], atol=3e-6, rtol=0)
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, device=device).expand_as(A), atol=3e-6, rtol=0)
+
+
+@pytest.mark.parametrize("eigenvalues", [
+    (0.2, 0.5, 1.0), (1e-9, 0.9, 1.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0), (1e-3, 1e-3, 1.0), (1e-8, 1e-8, 1.0),
+    (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1e-24, 1e-20, 1e-20), (1 - 2e-9, 1 - 1e-9, 1.0),
+])  # fmt: skip
+def test_least_directions_are_those_of_lapack(eigenvalues):
+    """By the quotient of Rayleigh where the two least eigenvalues are equal, so that any direction between is right."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
+    A = np.einsum("nij,j,nkj->nik", turn, eigenvalues, turn)
+    A = (A + A.transpose(0, 2, 1)) / 2
+    found = least_directions(A[:, PAIRS[0], PAIRS[1]])
+    values, vectors = np.linalg.eigh(A)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-14)
+    quotient = np.einsum("ni,nij,nj->n", found, A, found)
+    np.testing.assert_allclose(quotient, values[:, 0], atol=1e-14 * max(eigenvalues))
+    if eigenvalues[1] - eigenvalues[0] > 0.1 * max(eigenvalues):
+        np.testing.assert_allclose(np.abs((found * vectors[:, :, 0]).sum(1)), 1, atol=1e-13)

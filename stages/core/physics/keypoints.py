@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
+from stages.core.kernels.threads import parallel_map
 from stages.core.physics.particles import inliers, usable
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints
@@ -52,22 +53,21 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
     """
     g = scene.gaussians.to("cpu")
     good = usable(g)
-    rest, ids = [], []
-    for o in scene.objects:
-        mine = g.object_id == o.id
+
+    def pick(id: int) -> Float[Tensor, "k 3"]:
+        mine = g.object_id == id
         means = g.means[mine & good] if bool((mine & good).any()) else g.means[mine & g.means.isfinite().all(1)]
         if not len(means):
-            continue
+            return means
         means = means[inliers(means)]
         if len(means) > MAX_CANDIDATES:
             order = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))
             means = means[order[:MAX_CANDIDATES]]
-        picked = means[farthest_points(means, count, seed)].unique(dim=0)
-        rest.append(picked)
-        ids.append(torch.full((len(picked),), o.id))
-    if not rest:
-        return Keypoints(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64))
-    return Keypoints(torch.cat(rest), torch.cat(ids))
+        return means[farthest_points(means, count, seed)].unique(dim=0)
+
+    picked = parallel_map(pick, [o.id for o in scene.objects])
+    ids = [torch.full((len(rest),), o.id) for o, rest in zip(scene.objects, picked, strict=True)]
+    return Keypoints(torch.cat([torch.zeros(0, 3), *picked]), torch.cat([torch.zeros(0, dtype=torch.int64), *ids]))
 
 
 def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:

@@ -162,7 +162,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     InputError for an object without any usable Gaussian.
     """
     points, gap = _cloud(scene, object_id, seed)
-    spacing = _spacing(usable_means(scene, object_id).double())
+    spacing = _usable_spacing(scene, object_id)
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
     origin = first - h / 2
@@ -215,7 +215,13 @@ def _topples(body: np.ndarray) -> bool:
 def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float]:
     """`surface_points` of an object, and the gap between them that is closed."""
     points = surface_points(scene, object_id, seed)
-    return points, max(_gap(points), CLOSED * _spacing(usable_means(scene, object_id).double()))
+    return points, max(_gap(points), CLOSED * _usable_spacing(scene, object_id))
+
+
+@cached_in_scene
+def _usable_spacing(scene: Scene, object_id: int) -> float:
+    """`_spacing` of an object's usable Gaussians."""
+    return _spacing(usable_means(scene, object_id).double())
 
 
 def _spacing(means: Float[Tensor, "n 3"]) -> float:

@@ -27,6 +27,7 @@ from stages.lab.fit.search import (
     settled,
     simulations,
 )
+from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
 PROBABLE = 1.0  # squared distance of initial values from an estimate up to which they are kept [its covariance]
@@ -182,7 +183,8 @@ def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:
     """The command that repeats the motion."""
     options = fit.problem.options
     contact, rest = ["--contact learned"] * (options.engine == "ngff"), ["--no-rest"] * (not options.rest)
-    words = [f"--engine {options.engine}", *contact, *rest, f"--materials {out}"]
+    gravity = [f"--gravity {options.gravity:.4g}"] * (f"{options.gravity:.4g}" != f"{SimulateOptions.gravity:.4g}")
+    words = [f"--engine {options.engine}", *contact, *rest, *gravity, f"--materials {out}"]
     words += [f'--velocity "object={i} {",".join(f"{c:.4g}" for c in v)}"' for i, v in velocity.items()]
     words += [f"--lift {i}={height:.4g}" for i, height in fit.problem.prompts.lift.items()]
     return f"ngff simulate {scene} {' '.join(words)}"

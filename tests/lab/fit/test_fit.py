@@ -23,7 +23,7 @@ from stages.lab.fit.alignment import aligned
 from stages.lab.fit.fit import Fit, _command, run, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
-from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
+from stages.lab.fit.problem import _first_velocity, estimate_noise, pose_problem, read_problem
 from stages.lab.fit.search import PRIOR, Estimate, _derivatives, _evolve, descend, narrowed, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
@@ -133,6 +133,34 @@ def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
     fit = Fit(problem, Estimate(np.zeros(4), np.eye(4)), np.zeros(4), (0.0, 0.0), 0, 0.0)
     words = _command(slide / "scene.ply", slide / "m.json", fit, {1: (2.0, 0.5, 0.0)})
     assert words.endswith(f'--materials {slide / "m.json"} --velocity "object=1 2,0.5,0"')
+
+
+def test_the_command_that_repeats_the_motion_has_its_conditions(slide):
+    """Objects that are not held at rest, and a gravity that is not that of `ngff simulate`: of a track on the moon."""
+    scene, truth = read_scene(slide / "scene.ply"), read_trajectory(slide / "track.h5")
+    moon = replace(truth, info=replace(truth.info, gravity=(0.0, 0.0, -1.62)))
+    problem = pose_problem(scene, moon, ForcePrompts(), replace(OPTIONS, rest=False))
+    assert not problem.options.rest and problem.options.gravity == pytest.approx(1.62)
+    fit = Fit(problem, Estimate(np.zeros(4), np.eye(4)), np.zeros(4), (0.0, 0.0), 0, 0.0)
+    assert "--engine rigid --no-rest --gravity 1.62 --materials" in _command(
+        slide / "scene.ply", slide / "m.json", fit, {}
+    )
+    held = replace(problem, options=replace(problem.options, rest=True, gravity=9.81))
+    assert "--engine rigid --materials" in _command(
+        slide / "scene.ply", slide / "m.json", replace(fit, problem=held), {}
+    )
+
+
+@pytest.mark.parametrize(("heights", "found"), [
+    ([0.0, -0.001, -0.003, -0.002, -0.001], {}),  # settles on what it stands on
+    ([0.0, -0.00196, -0.00785, -0.01766, -0.03139], {}),  # is released from rest
+    ([0.0, 0.01804, 0.03215, 0.04234, 0.04861], {"x": 0.0, "y": 0.0, "z": 1.0}),  # is thrown upwards at 1 m/s
+])  # fmt: skip
+def test_a_thing_that_settles_does_not_fly(heights, found, slide):
+    """Of two explanations of the heights in the first five frames the nearer one counts."""
+    centre = torch.tensor([[0.0, 0.0, z] for z in heights])
+    velocity = _first_velocity(centre, 0.0025, read_scene(slide / "scene.ply"), SimulateOptions(dt=0.02))
+    assert velocity == pytest.approx(found, abs=1e-3)
 
 
 def test_the_learned_engine_is_fitted_with_contacts_that_know_stiffness(slide):

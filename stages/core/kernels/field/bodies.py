@@ -7,8 +7,11 @@ Shapes: i counts the b o objects, n points each. Body rows are (b o, BODY_SIZE);
 (b o, FIELD_SIZE, n), each component contiguous over the points.
 """
 
+from typing import NamedTuple
+
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from stages.core.kernels.field.vec3 import (
     add,
@@ -45,6 +48,65 @@ U, DU, VIRIAL = (tl.constexpr(i) for i in (0, 3, 6))
 WRENCH_SIZE = tl.constexpr(6)  # columns: force and torque
 
 
+class FieldConstants(NamedTuple):
+    """The constants of the field, which are defined in the modules of `stages.core.models.field`."""
+
+    FRAME: float
+    SEARCH_RADIUS: float
+    NO_CONTACT: float
+    FULL_CONTACT: float
+    PAIR_FRACTION: float
+    WALL_FRACTION: float
+    GAP_UNIT: float
+    ARM_UNIT: float
+    CONTACT_SATURATION: float
+    ACCELERATION_UNIT: float
+    SEPARATION_SPEED: float
+    MAX_FRICTION_SPEED: float
+    FRICTION_CUTOFF_SPEED: float
+    MAX_PENETRATION: float
+    MAX_RECOVERY_SPEED: float
+    MAX_SPEED: float
+    MAX_SPIN: float
+    MAX_DISPLACEMENT: float
+    MAX_SPRING_WEIGHT: float
+    MAX_DAMPER_WEIGHT: float
+
+
+class StepInputs(NamedTuple):
+    """What a step reads: contiguous arrays of the objects, their number, and the length of the step."""
+
+    arm: Tensor  # (b o n 3) keypoints in the body frame [m]
+    normal: Tensor  # (b o n 3)
+    valid: Tensor  # (b o n)
+    mass_fraction: Tensor  # (b o n)
+    spacing: Tensor  # (b o n) [m]
+    size: Tensor  # (b o) [m]
+    mass: Tensor  # (b o) [kg]
+    inverse: Tensor  # (b o 3 3) inverse inertia per unit of mass, body frame [1/m^2]
+    keypoint_inverse: Tensor  # (b o 3 3) that of the keypoints
+    pinned: Tensor  # (b o)
+    box: Tensor  # (b o 6) room of each object: low and high corner [m]
+    gravity: Tensor  # (b 3) [m/s^2]
+    embedding: Tensor  # (b o h)
+    stiffness: Tensor  # (b o) [1/s^2]
+    damping: Tensor  # (b o) [1/s]
+    compliance_scale: Tensor  # (b o)
+    o: int  # objects of a scene
+    n: int  # keypoints of an object
+    dt: float  # [s]
+    BLOCK: tl.constexpr  # n, padded to a power of two
+
+
+class Kinematics(NamedTuple):
+    """Bodies and keypoints after half a drift."""
+
+    body: Tensor  # (b o, BODY_SIZE)
+    points: Tensor  # (b o, POINT_SIZE, n)
+    field: Tensor  # (b o, FIELD_SIZE, n)
+    planes: Tensor  # (b o, 2, n) distance to the floor and to the nearest wall [m], the least of now and a frame later
+
+
 @triton.jit
 def nearest_wall(x, room):
     """Signed distance [m] to the nearest of the four walls and the ceiling, and its inward normal."""
@@ -68,22 +130,15 @@ def clamp_displacements(u, size, MAX_DISPLACEMENT: tl.constexpr):
 
 
 @triton.jit
-def drift_half_step(
-    com, quat, velocity, momentum, u, du, arm, normal, valid, size, inverse, pinned, box, body, moved, field, keys,
-    o, n, dt, MAX_DISPLACEMENT: tl.constexpr, NO_CONTACT: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Drift bodies by dt / 2 and evaluate their points at that time.
-
-    Writes `body`, `moved` (points in the world) and `field` (points in the body frame). `keys` (b o, 2, n) are
-    distances to the floor and to the nearest wall [m]: the smaller of now and FRAME seconds ahead.
-    """
-    i = tl.program_id(0)
-    free = 1 - tl.load(pinned + i).to(tl.float32)
-    inertia = read9(inverse + 9 * i)
-    v, L = scale3(free, read3(velocity + 3 * i)), scale3(free, read3(momentum + 3 * i))
-    c, q = drift(read3(com + 3 * i), read4(quat + 4 * i), v, L, inertia, dt / 2)
+def drift_half_step(state, inputs, drifted, C: tl.constexpr):
+    """Drift bodies by dt / 2 and evaluate their points at that time: writes `drifted`. C: the FieldConstants."""
+    i, n, dt = tl.program_id(0), inputs.n, inputs.dt
+    free = 1 - tl.load(inputs.pinned + i).to(tl.float32)
+    inertia = read9(inputs.inverse + 9 * i)
+    v, L = scale3(free, read3(state.velocity + 3 * i)), scale3(free, read3(state.momentum + 3 * i))
+    c, q = drift(read3(state.com + 3 * i), read4(state.quat + 4 * i), v, L, inertia, dt / 2)
     R, spin = rotation_matrix(q), angular_velocity(q, L, inertia)
-    to = body + BODY_SIZE * i
+    to = drifted.body + BODY_SIZE * i
     write3(to + COM, c)
     write3(to + VELOCITY, v)
     write3(to + MOMENTUM, L)
@@ -91,43 +146,44 @@ def drift_half_step(
     write9(to + INVERSE_INERTIA, rotate_tensor(R, inertia))
     write4(to + QUAT, q)
 
-    r = tl.arange(0, BLOCK)
+    r = tl.arange(0, inputs.BLOCK)
     inside = r < n
     at = (i * n + r) * 3
-    rate = scale3(free, load3(du + at, 1, inside))
-    shift = add(load3(u + at, 1, inside), scale3(dt / 2, rate))
-    shift = clamp_displacements(shift, tl.load(size + i), MAX_DISPLACEMENT)
-    lever = matvec3(R, add(load3(arm + at, 1, inside), shift))
+    rate = scale3(free, load3(state.du + at, 1, inside))
+    shift = add(load3(state.u + at, 1, inside), scale3(dt / 2, rate))
+    shift = clamp_displacements(shift, tl.load(inputs.size + i), C.MAX_DISPLACEMENT)
+    lever = matvec3(R, add(load3(inputs.arm + at, 1, inside), shift))
     speed = add(add(v, cross(spin, lever)), matvec3(R, rate))
     x = add(c, lever)
-    at_field = field + FIELD_SIZE * i * n + r
+    at_field = drifted.field + FIELD_SIZE * i * n + r
     store3(at_field + U * n, n, shift, inside)
     store3(at_field + DU * n, n, rate, inside)
-    at_moved = moved + POINT_SIZE * i * n + r
+    at_moved = drifted.points + POINT_SIZE * i * n + r
     store3(at_moved + POINT * n, n, x, inside)
     store3(at_moved + SPEED * n, n, speed, inside)
-    store3(at_moved + NORMAL * n, n, matvec3(R, load3(normal + at, 1, inside)), inside)
+    store3(at_moved + NORMAL * n, n, matvec3(R, load3(inputs.normal + at, 1, inside)), inside)
     store3(at_moved + ARM * n, n, lever, inside)
 
     infinity: tl.constexpr = float("inf")
-    is_valid = tl.load(valid + i * n + r, mask=inside, other=0) != 0
+    is_valid = tl.load(inputs.valid + i * n + r, mask=inside, other=0) != 0
     write3(to + BOX_LOW, scale3(-1.0, max3(where3(is_valid, scale3(-1.0, x), -infinity))))
     write3(to + BOX_HIGH, max3(where3(is_valid, x, -infinity)))
     fastest = tl.sqrt(tl.max(tl.where(is_valid, dot(speed, speed), 0.0)))
-    tl.store(to + CONTACT_RADIUS, NO_CONTACT / 2 + FRAME * fastest)
-    bounds = box + 6 * i
+    tl.store(to + CONTACT_RADIUS, C.NO_CONTACT / 2 + C.FRAME * fastest)
+    bounds = inputs.box + 6 * i
     height = x[2] - tl.load(bounds + 2)
-    key = tl.where(is_valid, tl.minimum(height, height + FRAME * speed[2]), infinity)
-    tl.store(keys + 2 * i * n + r, key, mask=inside)
+    key = tl.where(is_valid, tl.minimum(height, height + C.FRAME * speed[2]), infinity)
+    tl.store(drifted.planes + 2 * i * n + r, key, mask=inside)
     height, inward = nearest_wall(x, bounds)
-    key = tl.where(is_valid, tl.minimum(height, height + FRAME * dot(speed, inward)), infinity)
-    tl.store(keys + (2 * i + 1) * n + r, key, mask=inside)
+    key = tl.where(is_valid, tl.minimum(height, height + C.FRAME * dot(speed, inward)), infinity)
+    tl.store(drifted.planes + (2 * i + 1) * n + r, key, mask=inside)
 
 
 @triton.jit
-def world_points(com, quat, u, arm, points, n, BLOCK: tl.constexpr):
+def world_points(state, arm, points, n, BLOCK: tl.constexpr):
     """World positions (b o, n, 3) of the displaced points of bodies."""
     i, r = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     at, inside = (i * n + r) * 3, r < n
-    x = matvec3(rotation_matrix(read4(quat + 4 * i)), add(load3(arm + at, 1, inside), load3(u + at, 1, inside)))
-    store3(points + at, 1, add(read3(com + 3 * i), x), inside)
+    x = add(load3(arm + at, 1, inside), load3(state.u + at, 1, inside))
+    x = matvec3(rotation_matrix(read4(state.quat + 4 * i)), x)
+    store3(points + at, 1, add(read3(state.com + 3 * i), x), inside)

@@ -6,13 +6,41 @@ the closest of these, and of the points near floor and walls, as contact points.
 Reference: `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
 """
 
+from typing import NamedTuple
+
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from stages.core.kernels.field.bodies import BODY_SIZE, BOX_HIGH, BOX_LOW, CONTACT_RADIUS, POINT, POINT_SIZE, SPEED
 from stages.core.kernels.field.vec3 import add, dot, load3, scale3, store3, sub
 
-QUERY_BLOCK, CANDIDATE_CHUNK = 16, 128  # points per program, and candidates that it reads at a time
+QUERY_BLOCK, CANDIDATE_CHUNK = tl.constexpr(16), tl.constexpr(128)  # points per program, candidates read at a time
+
+
+class NearPoints(NamedTuple):
+    """Points of each object near the bounding box of each other object, k = o - 1 of them."""
+
+    position: Tensor  # (b o k 3 n) [m]
+    which: Tensor  # (b o k n) indices within the object
+    count: Tensor  # (b o k)
+    key: Tensor  # (b o k n) distance to the nearest point of the other object [m], the smaller of now and a frame later
+    partner: Tensor  # (b o k n) index of that point
+
+
+class ContactLists(NamedTuple):
+    """Contact points of each object, stored one after the other: with each other object, the floor and the walls."""
+
+    count: Tensor  # (b o, o + 1) of each list
+    point: Tensor  # (b o, slots) keypoint of each contact point
+    partner: Tensor  # (b o, slots) keypoint of the other object
+    record: Tensor  # (b o, slots COLUMNS) features, see `contact_features`
+    acceleration: Tensor  # (b o, o + 1, 3, n) of the keypoints, by each list [m/s^2]
+    wide: int  # slots of each list of contacts with another object
+    narrow: int  # slots of the list of contacts with walls
+    slots: int  # of all lists
+    FLOOR_BLOCKS: tl.constexpr  # blocks of rows of the floor's list, padded to a power of two
+    PLANE_BLOCKS: tl.constexpr  # of the lists of floor and walls
 
 
 @triton.jit
@@ -29,50 +57,45 @@ def _contact_distance(body, i, j, SEARCH_RADIUS: tl.constexpr):
 
 
 @triton.jit
-def gather_candidates(
-    body, moved, valid, positions, which, candidates, o, n, SEARCH_RADIUS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """List the points of object i within contact distance of another object's bounding box: `positions`,
-    `which` (point indices) and `candidates` (their number)."""
-    i, k = tl.program_id(0), tl.program_id(1)
+def gather_candidates(inputs, drifted, candidates, C: tl.constexpr):
+    """List the points of object i within contact distance of another object's bounding box: `position`, `which` and
+    `count` of the candidates."""
+    i, k, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n
     j = other_object(i, k, o)
-    radius = _contact_distance(body, i, j, SEARCH_RADIUS)
-    r = tl.arange(0, BLOCK)
-    near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
-    x = load3(moved + (POINT_SIZE * i + POINT) * n + r, n, r < n)
+    radius = _contact_distance(drifted.body, i, j, C.SEARCH_RADIUS)
+    r = tl.arange(0, inputs.BLOCK)
+    near = tl.load(inputs.valid + i * n + r, mask=r < n, other=0) != 0
+    x = load3(drifted.points + (POINT_SIZE * i + POINT) * n + r, n, r < n)
     for axis in tl.static_range(3):
-        near &= x[axis] > tl.load(body + BODY_SIZE * j + BOX_LOW + axis) - radius
-        near &= x[axis] < tl.load(body + BODY_SIZE * j + BOX_HIGH + axis) + radius
+        near &= x[axis] > tl.load(drifted.body + BODY_SIZE * j + BOX_LOW + axis) - radius
+        near &= x[axis] < tl.load(drifted.body + BODY_SIZE * j + BOX_HIGH + axis) + radius
     row = i * (o - 1) + k
     slot = tl.cumsum(near.to(tl.int32), 0) - 1
-    store3(positions + 3 * row * n + slot, n, x, near)
-    tl.store(which + row * n + slot, r, mask=near)
-    tl.store(candidates + row, tl.sum(near.to(tl.int32)))
+    store3(candidates.position + 3 * row * n + slot, n, x, near)
+    tl.store(candidates.which + row * n + slot, r, mask=near)
+    tl.store(candidates.count + row, tl.sum(near.to(tl.int32)))
 
 
 @triton.jit
-def nearest_candidates(
-    body, moved, positions, which, candidates, keys, partner, o, n, SEARCH_RADIUS: tl.constexpr, FRAME: tl.constexpr,
-    QUERY_BLOCK: tl.constexpr, CANDIDATE_CHUNK: tl.constexpr,
-):  # fmt: skip
-    """For each listed point find the other object's nearest listed point: `partner` (its index) and `keys` (its
-    distance [m], the smaller of now and FRAME seconds ahead)."""
+def nearest_candidates(inputs, drifted, candidates, C: tl.constexpr):
+    """For each listed point find the other object's nearest listed point: `partner` and `key` of the candidates."""
+    o, n = inputs.o, inputs.n
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
     j = other_object(i, k, o)
     row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
-    count, last = tl.load(candidates + row), tl.load(candidates + other)
+    count, last = tl.load(candidates.count + row), tl.load(candidates.count + other)
     first = tl.program_id(1) * QUERY_BLOCK
     if first < count:
-        radius = _contact_distance(body, i, j, SEARCH_RADIUS)
+        radius = _contact_distance(drifted.body, i, j, C.SEARCH_RADIUS)
         infinity: tl.constexpr = float("inf")
         e = first + tl.arange(0, QUERY_BLOCK)
-        x = load3(positions + 3 * row * n + e, n, e < count)
+        x = load3(candidates.position + 3 * row * n + e, n, e < count)
         column = tl.arange(0, CANDIDATE_CHUNK)
         smallest = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], infinity, tl.float32)
         chunk = tl.zeros([QUERY_BLOCK, CANDIDATE_CHUNK], tl.int32)
         for start in range(0, last, CANDIDATE_CHUNK):
             s = start + column
-            y = load3(positions + 3 * other * n + s, n, s < last, infinity)
+            y = load3(candidates.position + 3 * other * n + s, n, s < last, infinity)
             dx, dy, dz = x[0][:, None] - y[0][None, :], x[1][:, None] - y[1][None, :], x[2][:, None] - y[2][None, :]
             squared = dx * dx + dy * dy + dz * dz
             chunk = tl.where(squared < smallest, start, chunk)
@@ -80,15 +103,16 @@ def nearest_candidates(
         best = tl.min(smallest, 1)
         entry = tl.min(tl.where(smallest == best[:, None], chunk + column[None, :], n), 1)
         found = (e < count) & (best < radius * radius)
-        own_point = tl.load(which + row * n + e, mask=found, other=0)
-        other_point = tl.load(which + other * n + entry, mask=found, other=0)
-        at_own, at_other = moved + POINT_SIZE * i * n + own_point, moved + POINT_SIZE * j * n + other_point
+        own_point = tl.load(candidates.which + row * n + e, mask=found, other=0)
+        other_point = tl.load(candidates.which + other * n + entry, mask=found, other=0)
+        at_own = drifted.points + POINT_SIZE * i * n + own_point
+        at_other = drifted.points + POINT_SIZE * j * n + other_point
         offset = sub(x, load3(at_other + POINT * n, n, found))
         rate = sub(load3(at_own + SPEED * n, n, found), load3(at_other + SPEED * n, n, found))
-        offset = add(offset, scale3(FRAME, rate))
+        offset = add(offset, scale3(C.FRAME, rate))
         key = tl.where(found, tl.sqrt(tl.minimum(best, dot(offset, offset))), infinity)
-        tl.store(keys + row * n + e, key, mask=e < count)
-        tl.store(partner + row * n + e, other_point, mask=e < count)
+        tl.store(candidates.key + row * n + e, key, mask=e < count)
+        tl.store(candidates.partner + row * n + e, other_point, mask=e < count)
 
 
 @triton.jit
@@ -106,43 +130,37 @@ def _smallest(key, near, count):
 
 
 @triton.jit
-def select_contacts(
-    keys, planes, which, partner, candidates, valid, count, point, other_point, accelerations, o, n, wide, narrow,
-    slots, PAIR_FRACTION: tl.constexpr, WALL_FRACTION: tl.constexpr, NO_CONTACT: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+def select_contacts(inputs, drifted, candidates, lists, C: tl.constexpr):
     """Select the contact points of an object with one other object, the floor or the walls: the closest ones, at most
-    a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes the indices of its points and of the
-    other object's, and counts.
-
-    The lists of an object are stored one after the other: other objects (`wide` slots each), floor, walls (`narrow`
-    slots), `slots` in all.
-    """
-    i, k, m = tl.program_id(0), tl.program_id(1), o - 1
-    r = tl.arange(0, BLOCK)
-    limit_count = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
+    a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes `count`, `point` and `partner` of the
+    lists, and zeros as accelerations."""
+    i, k, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n
+    m = o - 1
+    r = tl.arange(0, inputs.BLOCK)
+    limit_count = tl.sum(tl.load(inputs.valid + i * n + r, mask=r < n, other=0).to(tl.int32))
     infinity: tl.constexpr = float("inf")
-    zero = tl.zeros([BLOCK], tl.float32)
-    store3(accelerations + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
-    to = i * slots + k * wide
+    zero = tl.zeros([inputs.BLOCK], tl.float32)
+    store3(lists.acceleration + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
+    to = i * lists.slots + k * lists.wide
     if k < m:
         row = i * m + k
-        listed = r < tl.load(candidates + row)
-        key = tl.load(keys + row * n + r, mask=listed, other=infinity)
-        own = tl.load(which + row * n + r, mask=listed, other=0)
-        other = tl.load(partner + row * n + r, mask=listed, other=0)
-        limit_count = tl.ceil(PAIR_FRACTION * limit_count).to(tl.int32)
+        listed = r < tl.load(candidates.count + row)
+        key = tl.load(candidates.key + row * n + r, mask=listed, other=infinity)
+        own = tl.load(candidates.which + row * n + r, mask=listed, other=0)
+        other = tl.load(candidates.partner + row * n + r, mask=listed, other=0)
+        limit_count = tl.ceil(C.PAIR_FRACTION * limit_count).to(tl.int32)
     else:
-        key = tl.load(planes + (2 * i + k - m) * n + r, mask=r < n, other=infinity)
+        key = tl.load(drifted.planes + (2 * i + k - m) * n + r, mask=r < n, other=infinity)
         own, other = r, r
         if k > m:
-            to = (i + 1) * slots - narrow
-            limit_count = tl.ceil(WALL_FRACTION * limit_count).to(tl.int32)
-    near = key < NO_CONTACT
+            to = (i + 1) * lists.slots - lists.narrow
+            limit_count = tl.ceil(C.WALL_FRACTION * limit_count).to(tl.int32)
+    near = key < C.NO_CONTACT
     if tl.sum(near.to(tl.int32)) > limit_count:
         bits, limit = _smallest(key, near, limit_count)
         near &= bits <= limit
     slot = tl.cumsum(near.to(tl.int32), 0) - 1
     near &= slot < limit_count  # ties
-    tl.store(point + to + slot, own, mask=near)
-    tl.store(other_point + to + slot, other, mask=near)
-    tl.store(count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))
+    tl.store(lists.point + to + slot, own, mask=near)
+    tl.store(lists.partner + to + slot, other, mask=near)
+    tl.store(lists.count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

@@ -6,8 +6,11 @@ contact, and `decode_forces` decodes accelerations, forces and torques.
 Reference: `stages.core.models.field.contact_forces`. Written in Triton (see `compilers`).
 """
 
+from typing import NamedTuple
+
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from stages.core.kernels.field.bodies import WRENCH_SIZE
 from stages.core.kernels.field.broad_phase import other_object
@@ -15,6 +18,7 @@ from stages.core.kernels.field.contact_features import COLUMNS, GATE, MASS_FRACT
 from stages.core.kernels.field.layers import (
     MAX_VECTORS,
     PADDED_VECTORS,
+    ROWS,
     invariant_layer,
     linear_layer,
     matvec,
@@ -24,179 +28,215 @@ from stages.core.kernels.field.layers import (
 from stages.core.kernels.field.vec3 import add, cross, dot, load3, scale3, store3, sub, sum3, write3
 
 
+class ContactLayers(NamedTuple):
+    """Layers (weight, bias) of a ContactNet, by their names there, and its numbers of features."""
+
+    own_projection: tuple
+    partner_projection: tuple | None
+    input_layer: tuple
+    message: tuple
+    context_projection: tuple
+    decoder: tuple
+    VECTORS: tl.constexpr
+    SCALARS: tl.constexpr
+
+
+class FieldLayers(NamedTuple):
+    """Layers (weight, bias) of a ForceField, by their names there, and what all of its layers have in common."""
+
+    pairs: ContactLayers
+    planes: ContactLayers
+    object_update: tuple
+    pair_update: tuple
+    plane_update: tuple
+    friction: tuple
+    embedding_projection: tuple  # of the deformation network, as the two that follow
+    deformation_input: tuple
+    deformation_decoder: tuple
+    H: tl.constexpr  # hidden columns
+    PRECISION: tl.constexpr  # of products
+
+
+class Messages(NamedTuple):
+    """What the networks make of the contact points. Blocks are of ROWS contact points."""
+
+    offset: Tensor  # (b o, o + 2, h) embeddings in the first layers: of each list, and of the deformation network
+    message: Tensor  # (b o, slots, h)
+    weight: Tensor  # (b o, slots)
+    block_sum: Tensor  # (b o, blocks, h) weighted sum of messages
+    block_weight: Tensor  # (b o, blocks)
+    mean: Tensor  # (b o, o + 1, h) of each list
+    scale: Tensor  # (b o, o + 1) factor of its weights
+    status: Tensor  # (b o, h) of each object
+    friction: Tensor  # (b o) [m/s]
+    context: Tensor  # (b o, o + 1, h) input of the second layer for the points of each list
+    wrenches: Tensor  # (b o, blocks, WRENCH_SIZE) force and torque, per unit of (reduced) mass
+
+
 @triton.jit
-def project_embeddings(
-    embedding, own, own_b, partner, partner_b, plane, plane_b, deformation, deformation_b, offset, o, H: tl.constexpr,
-):  # fmt: skip
+def _project(layer, x, H: tl.constexpr):
+    """Layer (weight, bias) from H to H columns, of one row."""
+    return matvec(layer[0], x, 0, H, H) + tl.load(layer[1] + tl.arange(0, H))
+
+
+@triton.jit
+def project_embeddings(inputs, layers, messages):
     """Contribution of the object embeddings to the first layer of each contact; in the row after all contacts, to the
-    first layer of the deformation network."""
-    i, k, m = tl.program_id(0), tl.program_id(1), o - 1
-    h = tl.arange(0, H)
-    own_embedding = tl.load(embedding + i * H + h)
+    first layer of the deformation network: `offset`."""
+    H: tl.constexpr = layers.H
+    i, k, o = tl.program_id(0), tl.program_id(1), inputs.o
+    m, h = o - 1, tl.arange(0, H)
+    own = tl.load(inputs.embedding + i * H + h)
     if k < m:
-        partner_embedding = tl.load(embedding + other_object(i, k, o) * H + h)
-        y = (
-            matvec(own, own_embedding, 0, H, H)
-            + tl.load(own_b + h)
-            + matvec(partner, partner_embedding, 0, H, H)
-            + tl.load(partner_b + h)
-        )
+        partner = tl.load(inputs.embedding + other_object(i, k, o) * H + h)
+        y = _project(layers.pairs.own_projection, own, H) + _project(layers.pairs.partner_projection, partner, H)
     elif k < m + 2:
-        y = matvec(plane, own_embedding, 0, H, H) + tl.load(plane_b + h)
+        y = _project(layers.planes.own_projection, own, H)
     else:
-        y = matvec(deformation, own_embedding, 0, H, H) + tl.load(deformation_b + h)
-    tl.store(offset + (i * (o + 2) + k) * H + h, y)
+        y = _project(layers.embedding_projection, own, H)
+    tl.store(messages.offset + (i * (o + 2) + k) * H + h, y)
 
 
 @triton.jit
-def _encode(
-    record, there, net, offset, message, weight, message_sum, total, VECTORS: tl.constexpr, SCALARS: tl.constexpr,
-    ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
-    """Messages of a block of contact points, their weights, and the weighted sums of both over the block."""
+def _encode(record, there, net, offset, H: tl.constexpr, PRECISION: tl.constexpr):
+    """Messages of a block of contact points, and their weights."""
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
-    y = invariant_layer(record, r, net[0], net[1], ROWS, VECTORS, SCALARS, H, PRECISION)
+    y = invariant_layer(record, net.input_layer, net.VECTORS, net.SCALARS, H, PRECISION)
     y = silu(y + tl.load(offset + h)[None, :])
-    y = silu(linear_layer(y, net[2], net[3], H, H, H, PRECISION))
-    attention = tl.sum(y * tl.load(net[4] + H * H + h)[None, :], 1) + tl.load(net[5] + H)
-    y = linear_layer(y, net[4], net[5], H, H, H, PRECISION)
+    y = silu(linear_layer(y, net.message[0], H, H, H, PRECISION))
+    w, b = net.message[1]
+    attention = tl.sum(y * tl.load(w + H * H + h)[None, :], 1) + tl.load(b + H)
+    y = linear_layer(y, net.message[1], H, H, H, PRECISION)
     attention = tl.exp(8 * tl.sigmoid(attention / 2) - 4)  # exp(4 tanh(attention / 4))
     gate = tl.load(record + GATE * ROWS + r, mask=there, other=0.0)
     mass_fraction = tl.load(record + MASS_FRACTION * ROWS + r)
-    w = tl.where(there, gate * mass_fraction * attention, 0.0)
-    tl.store(message + r[:, None] * H + h[None, :], y)
-    tl.store(weight + r, w)
-    tl.store(message_sum + h, tl.sum(tl.where(there[:, None], w[:, None] * y, 0.0), 0))
-    tl.store(total, tl.sum(w))
+    return y, tl.where(there, gate * mass_fraction * attention, 0.0)
 
 
 @triton.jit
-def encode_messages(
-    record, count, pairs, planes, offset, message, weight, message_sum, total, o, n, wide, narrow, slots,
-    ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
+def encode_messages(inputs, lists, layers, messages):
     """Message and weight of each contact point; weighted sums over each block."""
-    i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
-    k, start = contact_list(slot, m, n, wide, narrow, slots)
-    listed = slot - start + tl.arange(0, ROWS) < tl.load(count + i * (o + 1) + k)
+    H: tl.constexpr = layers.H
+    i, o, slots = tl.program_id(0), inputs.o, lists.slots
+    m, slot = o - 1, tl.program_id(1) * ROWS
+    k, start = contact_list(lists, slot, m)
+    r, h = tl.arange(0, ROWS), tl.arange(0, H)
+    listed = slot - start + r < tl.load(lists.count + i * (o + 1) + k)
     at, block = i * slots + slot, i * (slots // ROWS) + tl.program_id(1)
-    if slot - start < tl.load(count + i * (o + 1) + k):
+    if slot - start < tl.load(lists.count + i * (o + 1) + k):
+        record, offset = lists.record + at * COLUMNS, messages.offset + (i * (o + 2) + k) * H
         if k < m:
-            _encode(record + at * COLUMNS, listed, pairs, offset + (i * (o + 2) + k) * H, message + at * H,
-                    weight + at, message_sum + block * H, total + block, 10, 7, ROWS, H, PRECISION)  # fmt: skip
+            y, w = _encode(record, listed, layers.pairs, offset, H, layers.PRECISION)
         else:
-            _encode(record + at * COLUMNS, listed, planes, offset + (i * (o + 2) + k) * H, message + at * H,
-                    weight + at, message_sum + block * H, total + block, 8, 5, ROWS, H, PRECISION)  # fmt: skip
+            y, w = _encode(record, listed, layers.planes, offset, H, layers.PRECISION)
+        tl.store(messages.message + (at + r[:, None]) * H + h[None, :], y)
+        tl.store(messages.weight + at + r, w)
+        tl.store(messages.block_sum + block * H + h, tl.sum(tl.where(listed[:, None], w[:, None] * y, 0.0), 0))
+        tl.store(messages.block_weight + block, tl.sum(w))
     else:
-        h = tl.arange(0, H)
-        tl.store(message_sum + block * H + h, tl.zeros([H], tl.float32))
-        tl.store(total + block, 0.0)
+        tl.store(messages.block_sum + block * H + h, tl.zeros([H], tl.float32))
+        tl.store(messages.block_weight + block, 0.0)
 
 
 @triton.jit
-def aggregate_messages(
-    embedding, message_sum, total, net, friction_w, friction_b, mean_message, scale, status, friction, o, n, wide,
-    narrow, slots, CONTACT_SATURATION: tl.constexpr, MAX_FRICTION_SPEED: tl.constexpr, ROWS: tl.constexpr,
-    BLOCKS: tl.constexpr, H: tl.constexpr,
-):  # fmt: skip
-    """Mean message of each contact of an object, its status vector from all of them, and the floor's friction [m/s]."""
-    i, m = tl.program_id(0), o - 1
-    h, block = tl.arange(0, H), tl.arange(0, BLOCKS)
+def aggregate_messages(inputs, lists, layers, messages, C: tl.constexpr):
+    """Mean message of each contact of an object, its status vector from all of them, and the floor's friction."""
+    H: tl.constexpr = layers.H
+    i, o, slots = tl.program_id(0), inputs.o, lists.slots
+    m, h, block = o - 1, tl.arange(0, H), tl.arange(0, lists.FLOOR_BLOCKS)
     others, planes, supported = tl.zeros([H], tl.float32), tl.zeros([H], tl.float32), 0.0
     for k in range(o + 1):
-        start = tl.where(k > m, slots - narrow, k * wide)
-        end = tl.where(k > m, slots, tl.where(k < m, start + wide, slots - narrow))
+        start = tl.where(k > m, slots - lists.narrow, k * lists.wide)
+        end = tl.where(k > m, slots, tl.where(k < m, start + lists.wide, slots - lists.narrow))
         first, mask = (i * slots + start) // ROWS, block < (end - start) // ROWS
-        messages = tl.load(message_sum + (first + block)[:, None] * H + h[None, :], mask=mask[:, None], other=0.0)
-        total_weight = tl.sum(tl.load(total + first + block, mask=mask, other=0.0))
-        normaliser = 1 / (total_weight + CONTACT_SATURATION)
-        x = normaliser * tl.sum(messages, 0)
-        tl.store(mean_message + (i * (o + 1) + k) * H + h, x)
-        tl.store(scale + i * (o + 1) + k, normaliser)
+        at = messages.block_sum + (first + block)[:, None] * H + h[None, :]
+        total = tl.sum(tl.load(at, mask=mask[:, None], other=0.0), 0)
+        total_weight = tl.sum(tl.load(messages.block_weight + first + block, mask=mask, other=0.0))
+        normaliser = 1 / (total_weight + C.CONTACT_SATURATION)
+        x = normaliser * total
+        tl.store(messages.mean + (i * (o + 1) + k) * H + h, x)
+        tl.store(messages.scale + i * (o + 1) + k, normaliser)
         others += tl.where(k < m, x, 0.0)
         planes += tl.where(k < m, 0.0, x)
         supported += tl.where(k == m, total_weight * normaliser, 0.0)
-    y = matvec(net[0], tl.load(embedding + i * H + h), 0, 3 * H, H) + matvec(net[0], others, H, 3 * H, H)
-    y = silu(y + matvec(net[0], planes, 2 * H, 3 * H, H) + tl.load(net[1] + h))
-    y = matvec(net[2], y, 0, H, H) + tl.load(net[3] + h)
-    tl.store(status + i * H + h, y)
-    ratio = tl.sigmoid(tl.sum(y * tl.load(friction_w + h)) + tl.load(friction_b))
-    tl.store(friction + i, MAX_FRICTION_SPEED * ratio * supported)
+    w, b = layers.object_update[0]
+    y = matvec(w, tl.load(inputs.embedding + i * H + h), 0, 3 * H, H) + matvec(w, others, H, 3 * H, H)
+    y = silu(y + matvec(w, planes, 2 * H, 3 * H, H) + tl.load(b + h))
+    y = _project(layers.object_update[1], y, H)
+    tl.store(messages.status + i * H + h, y)
+    ratio = tl.sigmoid(tl.sum(y * tl.load(layers.friction[0] + h)) + tl.load(layers.friction[1]))
+    tl.store(messages.friction + i, C.MAX_FRICTION_SPEED * ratio * supported)
 
 
 @triton.jit
-def update_contacts(
-    mean_message, status, pair_update, plane_update, pairs, pairs_b, planes, planes_b, context, o, H: tl.constexpr,
-):  # fmt: skip
-    """Second-layer input of a contact's points: from both objects' mean messages of it and their status vectors."""
-    i, k, m = tl.program_id(0), tl.program_id(1), o - 1
-    h = tl.arange(0, H)
-    x, own = tl.load(mean_message + (i * (o + 1) + k) * H + h), tl.load(status + i * H + h)
+def update_contacts(inputs, layers, messages):
+    """Second-layer input of a contact's points, from both objects' mean messages of it and their status vectors:
+    `context`."""
+    H: tl.constexpr = layers.H
+    i, k, o = tl.program_id(0), tl.program_id(1), inputs.o
+    m, h = o - 1, tl.arange(0, H)
+    x, own = tl.load(messages.mean + (i * (o + 1) + k) * H + h), tl.load(messages.status + i * H + h)
     if k < m:
         j = other_object(i, k, o)
-        other = tl.load(mean_message + (j * (o + 1) + i % o - (i > j)) * H + h)
-        y = matvec(pair_update[0], x, 0, 4 * H, H) + matvec(pair_update[0], other, H, 4 * H, H)
-        y += matvec(pair_update[0], own, 2 * H, 4 * H, H)
-        y += matvec(pair_update[0], tl.load(status + j * H + h), 3 * H, 4 * H, H)
-        y = matvec(pair_update[2], silu(y + tl.load(pair_update[1] + h)), 0, H, H) + tl.load(pair_update[3] + h)
-        y = matvec(pairs, y, 0, H, H) + tl.load(pairs_b + h)
+        other = tl.load(messages.mean + (j * (o + 1) + i % o - (i > j)) * H + h)
+        w, b = layers.pair_update[0]
+        y = matvec(w, x, 0, 4 * H, H) + matvec(w, other, H, 4 * H, H)
+        y += matvec(w, own, 2 * H, 4 * H, H)
+        y += matvec(w, tl.load(messages.status + j * H + h), 3 * H, 4 * H, H)
+        y = _project(layers.pair_update[1], silu(y + tl.load(b + h)), H)
+        y = _project(layers.pairs.context_projection, y, H)
     else:
-        y = matvec(plane_update[0], x, 0, 2 * H, H) + matvec(plane_update[0], own, H, 2 * H, H)
-        y = matvec(plane_update[2], silu(y + tl.load(plane_update[1] + h)), 0, H, H) + tl.load(plane_update[3] + h)
-        y = matvec(planes, y, 0, H, H) + tl.load(planes_b + h)
-    tl.store(context + (i * (o + 1) + k) * H + h, y)
+        w, b = layers.plane_update[0]
+        y = matvec(w, x, 0, 2 * H, H) + matvec(w, own, H, 2 * H, H)
+        y = _project(layers.plane_update[1], silu(y + tl.load(b + h)), H)
+        y = _project(layers.planes.context_projection, y, H)
+    tl.store(messages.context + (i * (o + 1) + k) * H + h, y)
 
 
 @triton.jit
-def _decode(
-    record, there, net, context, message, weight, VECTORS: tl.constexpr, ACCELERATION_UNIT: tl.constexpr,
-    ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
-    """Weighted accelerations (3 vectors of ROWS) of a block of contact points."""
+def _decode(record, there, net, x, H: tl.constexpr, PRECISION: tl.constexpr):
+    """Accelerations of a block of contact points (3 vectors of ROWS), from the inputs x of the second layer."""
+    x = silu(linear_layer(silu(x), net.decoder[0], H, H, H, PRECISION))
+    x = linear_layer(x, net.decoder[1], net.VECTORS, H, PADDED_VECTORS, PRECISION)
+    return weighted_vectors(record, there, x, net.VECTORS)
+
+
+@triton.jit
+def decode_forces(inputs, lists, layers, messages, C: tl.constexpr):
+    """Decode the acceleration of each contact point, and force and torque of each block (`wrenches`): per unit of
+    mass, for pairs of objects of reduced mass."""
+    H: tl.constexpr = layers.H
+    i, o, n, slots = tl.program_id(0), inputs.o, inputs.n, lists.slots
+    m, slot = o - 1, tl.program_id(1) * ROWS
+    k, start = contact_list(lists, slot, m)
+    row, to = i * (o + 1) + k, messages.wrenches + (i * (slots // ROWS) + tl.program_id(1)) * WRENCH_SIZE
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
-    x = tl.load(message + r[:, None] * H + h[None, :], mask=there[:, None], other=0.0)
-    x = silu(linear_layer(silu(x + tl.load(context + h)[None, :]), net[0], net[1], H, H, H, PRECISION))
-    x = linear_layer(x, net[2], net[3], VECTORS, H, PADDED_VECTORS, PRECISION)
-    a = weighted_vectors(record, r, there, x, ROWS, VECTORS)
-    return scale3(weight * ACCELERATION_UNIT, a)
-
-
-@triton.jit
-def decode_forces(
-    record, count, point, pairs, planes, context, message, weight, scale, acceleration, parts, o, n, wide, narrow,
-    slots, ACCELERATION_UNIT: tl.constexpr, SEPARATION_SPEED: tl.constexpr, GAP_UNIT: tl.constexpr,
-    ARM_UNIT: tl.constexpr, ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
-    """Decode the acceleration of each contact point [m/s^2], and force and torque of each block into `parts`: per unit
-    of mass, for pairs of objects of reduced mass."""
-    i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
-    k, start = contact_list(slot, m, n, wide, narrow, slots)
-    row, to = i * (o + 1) + k, parts + (i * (slots // ROWS) + tl.program_id(1)) * WRENCH_SIZE
-    r = tl.arange(0, ROWS)
-    listed = slot - start + r < tl.load(count + row)
-    if slot - start < tl.load(count + row):
+    listed = slot - start + r < tl.load(lists.count + row)
+    if slot - start < tl.load(lists.count + row):
         at = i * slots + slot
-        w = tl.load(weight + at + r, mask=listed, other=0.0) * tl.load(scale + row)
-        features = record + at * COLUMNS
+        record = lists.record + at * COLUMNS
+        w = tl.load(messages.weight + at + r, mask=listed, other=0.0) * tl.load(messages.scale + row)
+        x = tl.load(messages.message + (at + r[:, None]) * H + h[None, :], mask=listed[:, None], other=0.0)
+        x += tl.load(messages.context + row * H + h)[None, :]
+        unit = w * C.ACCELERATION_UNIT
         if k < m:
-            a = _decode(features, listed, pairs, context + row * H, message + at * H, w, 10, ACCELERATION_UNIT, ROWS, H,
-                        PRECISION)  # fmt: skip
-            offset = load3(features + r, MAX_VECTORS * ROWS, listed)
-            arm = load3(features + 4 * ROWS + r, MAX_VECTORS * ROWS, listed)
-            arm = sub(scale3(ARM_UNIT, arm), scale3(GAP_UNIT / 2, offset))  # to the midpoint of the two points
+            a = scale3(unit, _decode(record, listed, layers.pairs, x, H, layers.PRECISION))
+            offset = load3(record + r, MAX_VECTORS * ROWS, listed)
+            arm = load3(record + 4 * ROWS + r, MAX_VECTORS * ROWS, listed)
+            arm = sub(scale3(C.ARM_UNIT, arm), scale3(C.GAP_UNIT / 2, offset))  # to the midpoint of the two points
         else:
-            a = _decode(features, listed, planes, context + row * H, message + at * H, w, 8, ACCELERATION_UNIT, ROWS, H,
-                        PRECISION)  # fmt: skip
-            inward = load3(features + r, MAX_VECTORS * ROWS, listed)
-            arm = scale3(ARM_UNIT, load3(features + 3 * ROWS + r, MAX_VECTORS * ROWS, listed))
-            separation_speed = dot(load3(features + 2 * ROWS + r, MAX_VECTORS * ROWS, listed), inward)
-            along, unit = dot(a, inward), tl.maximum(w, 1e-9)
-            x = along / unit
-            push = unit * (tl.maximum(x, 0.0) + tl.log(1 + tl.exp(-tl.abs(x))))  # softplus: floor and walls only push
-            push = push / (1 + tl.maximum(separation_speed, 0.0) / SEPARATION_SPEED)
+            a = scale3(unit, _decode(record, listed, layers.planes, x, H, layers.PRECISION))
+            inward = load3(record + r, MAX_VECTORS * ROWS, listed)
+            arm = scale3(C.ARM_UNIT, load3(record + 3 * ROWS + r, MAX_VECTORS * ROWS, listed))
+            separation_speed = dot(load3(record + 2 * ROWS + r, MAX_VECTORS * ROWS, listed), inward)
+            along, weight = dot(a, inward), tl.maximum(w, 1e-9)
+            pull = along / weight
+            softplus = tl.maximum(pull, 0.0) + tl.log(1 + tl.exp(-tl.abs(pull)))
+            push = weight * softplus  # floor and walls only push
+            push = push / (1 + tl.maximum(separation_speed, 0.0) / C.SEPARATION_SPEED)
             a = add(a, scale3(push - along, inward))
-        own = tl.load(point + at + r, mask=listed, other=0)
-        store3(acceleration + row * 3 * n + own, n, a, listed)
+        own = tl.load(lists.point + at + r, mask=listed, other=0)
+        store3(lists.acceleration + row * 3 * n + own, n, a, listed)
         F, T = sum3(a), sum3(cross(arm, a))
         write3(to, F)
         write3(to + 3, T)

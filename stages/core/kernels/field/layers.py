@@ -7,6 +7,7 @@ vectors first, then y, then z, then scalars.
 import triton
 import triton.language as tl
 
+ROWS = tl.constexpr(64)  # of a block
 MAX_VECTORS = tl.constexpr(12)  # vectors in a record
 FIRST_SCALAR = tl.constexpr(36)  # column of the first scalar
 PADDED_VECTORS = tl.constexpr(16)  # outputs that weight vectors, padded to what tl.dot takes
@@ -26,19 +27,22 @@ def matvec(w, x, first, INNER: tl.constexpr, H: tl.constexpr):
 
 
 @triton.jit
-def linear_layer(x, w, b, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
-    """Linear layer of a block of rows, from H columns to OUTER, padded to O."""
+def linear_layer(x, layer, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
+    """Linear layer (weight and bias) of a block of rows, from H columns to OUTER, padded to O."""
+    w, b = layer
     i, o = tl.arange(0, H), tl.arange(0, O)
     W = tl.load(w + o[None, :] * H + i[:, None], mask=o[None, :] < OUTER, other=0.0)
     return tl.dot(x, W, input_precision=PRECISION) + tl.load(b + o, mask=o < OUTER, other=0.0)[None, :]
 
 
 @triton.jit
-def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, SCALARS: tl.constexpr, H: tl.constexpr,
-         PRECISION: tl.constexpr):  # fmt: skip
+def invariant_layer(
+    record, layer, VECTORS: tl.constexpr, SCALARS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """Linear layer over the asinh of all dot products of the first VECTORS vectors, and SCALARS scalars: (ROWS, H)."""
+    w, b = layer
     PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
-    h = tl.arange(0, H)
+    r, h = tl.arange(0, ROWS), tl.arange(0, H)
     y = tl.zeros([ROWS, H], tl.float32)
     for first in tl.static_range(0, PRODUCTS + SCALARS, 32):
         c = first + tl.arange(0, 32)
@@ -65,9 +69,9 @@ def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, 
 
 
 @triton.jit
-def weighted_vectors(record, r, there, weights, ROWS: tl.constexpr, VECTORS: tl.constexpr):
+def weighted_vectors(record, there, weights, VECTORS: tl.constexpr):
     """Weighted sum of the first VECTORS vectors of each row, with `weights` (ROWS, PADDED_VECTORS)."""
-    v = tl.arange(0, PADDED_VECTORS)
+    r, v = tl.arange(0, ROWS), tl.arange(0, PADDED_VECTORS)
     at, mask = record + v[None, :] * ROWS + r[:, None], (v < VECTORS)[None, :] & there[:, None]
     return (tl.sum(weights * tl.load(at, mask=mask, other=0.0), 1),
             tl.sum(weights * tl.load(at + MAX_VECTORS * ROWS, mask=mask, other=0.0), 1),

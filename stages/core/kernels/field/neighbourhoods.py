@@ -10,7 +10,10 @@ from torch import Tensor
 
 from stages.core.kernels.field.vec3 import dot, load3, sub
 
-ROWS, CHUNK = 8, 256  # rows of the matrix per program, and columns that it computes at a time
+ROWS, CHUNK = (
+    tl.constexpr(8),
+    tl.constexpr(256),
+)  # rows of the matrix per program, and columns that it computes at a time
 
 
 @triton.jit
@@ -22,15 +25,15 @@ def _weights(arm, mass_fraction, x, slope, s, n):
 
 
 @triton.jit
-def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
+def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n):
     """Rows of the weight matrix of one object and radius, in two passes: their sums, then the normalised weights."""
-    table = tl.program_id(0)
-    i = table // scales
+    i = tl.program_id(0)
+    table = i * tl.num_programs(1) + tl.program_id(1)
     arm, mass_fraction, valid = arm + 3 * i * n, mass_fraction + i * n, valid + i * n
     out += table.to(tl.int64) * n * n
     radius = tl.load(radii + table)
     slope = -1 / (radius * radius)
-    r, column = tl.program_id(1) * ROWS + tl.arange(0, ROWS), tl.arange(0, CHUNK)
+    r, column = tl.program_id(2) * ROWS + tl.arange(0, ROWS), tl.arange(0, CHUNK)
     x = load3(arm + 3 * r, 1, r < n)
     total = tl.zeros([ROWS, CHUNK], tl.float32)
     for first in range(0, n, CHUNK):
@@ -53,5 +56,5 @@ def neighbourhood_weights(arm: Tensor, valid: Tensor, mass_fraction: Tensor, rad
     inputs = [x.contiguous() for x in (arm, valid, mass_fraction, radii)]
     scales = radii.shape[-1]
     out = torch.empty(b, o, scales, n, n, dtype=torch.float16, device=arm.device)
-    _neighbourhood_weights[(b * o * scales, triton.cdiv(n, ROWS))](*inputs, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
+    _neighbourhood_weights[(b * o, scales, triton.cdiv(n, ROWS.value))](*inputs, out, n)
     return out

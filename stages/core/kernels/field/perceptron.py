@@ -4,7 +4,7 @@ The kernel is written in Triton (see `compilers`), which is imported with this m
 """
 
 from collections.abc import Sequence
-from typing import Optional
+from typing import NamedTuple, Optional
 
 import torch
 import triton
@@ -19,6 +19,31 @@ CHUNK = 64  # input columns read at a time
 SMALL_BLOCK_ROWS = 65_536  # up to so many rows use smaller blocks, to occupy all multiprocessors
 
 
+class _Rows(NamedTuple):
+    """Inputs of the rows, see `perceptron`; each may be None but x."""
+
+    x: Tensor
+    vectors: Tensor | None
+    offset: Tensor | None
+    needed: Tensor | None
+    count: int
+    each: int  # rows of a group
+
+
+class _Widths(NamedTuple):
+    """Numbers of vectors and columns of the input and of each layer's output; the latter padded to powers of two."""
+
+    VECTORS: int
+    COLUMNS: int
+    HIDDEN: int
+    MIDDLE: int  # of the second of three layers
+    OUTER: int
+    K: int  # input columns read at a time
+    H: int
+    M: int
+    O: int
+
+
 @triton.jit
 def _component(vectors, r, there, i, VECTORS: tl.constexpr):
     """The i-th vector of each row."""
@@ -28,10 +53,10 @@ def _component(vectors, r, there, i, VECTORS: tl.constexpr):
 
 
 @triton.jit
-def _layer(h, weight, bias, INNER: tl.constexpr, OUTER: tl.constexpr, I: tl.constexpr, O: tl.constexpr,
-           PRECISION: tl.constexpr):  # fmt: skip
-    """SiLU, then a linear layer; I and O are the padded widths."""
-    i, o = tl.arange(0, I), tl.arange(0, O)
+def _layer(h, layer, INNER: tl.constexpr, OUTER: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
+    """SiLU, then a linear layer from INNER columns (h has them padded) to OUTER, padded to O."""
+    weight, bias = layer
+    i, o = tl.arange(0, h.shape[1]), tl.arange(0, O)
     h = h * tl.sigmoid(h)
     W = tl.load(weight + o[None, :] * INNER + i[:, None], mask=(i[:, None] < INNER) & (o[None, :] < OUTER), other=0.0)
     b = tl.load(bias + o, mask=o < OUTER, other=0.0)
@@ -39,55 +64,63 @@ def _layer(h, weight, bias, INNER: tl.constexpr, OUTER: tl.constexpr, I: tl.cons
 
 
 @triton.jit
-def _perceptron(
-    x, vectors, known, near, w0, b0, w1, b1, w2, b2, out, rows, each, VECTORS: tl.constexpr, COLUMNS: tl.constexpr,
-    HIDDEN: tl.constexpr, MIDDLE: tl.constexpr, OUTER: tl.constexpr, KNOWN: tl.constexpr, NEAR: tl.constexpr,
-    ACTIVE: tl.constexpr, DEEP: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr, K: tl.constexpr,
-    H: tl.constexpr, M: tl.constexpr, O: tl.constexpr,
-):  # fmt: skip
+def _first_layer(rows, r, in_range, layer, ACTIVE: tl.constexpr, D: tl.constexpr, PRECISION: tl.constexpr):
+    """First layer of a block of rows r; ACTIVE: after SiLU. D: the _Widths."""
+    weight, bias = layer
+    PRODUCTS: tl.constexpr = D.VECTORS * (D.VECTORS + 1) // 2
+    INNER: tl.constexpr = PRODUCTS + D.COLUMNS
+    H: tl.constexpr = D.H
+    h = tl.arange(0, H)
+    y = tl.zeros([r.shape[0], H], tl.float32)
+    if D.VECTORS:
+        for i in range(D.VECTORS):  # not unrolled, to limit register use
+            ax, ay, az = _component(rows.vectors, r, in_range, i, D.VECTORS)
+            for j in range(i, D.VECTORS):
+                bx, by, bz = _component(rows.vectors, r, in_range, j, D.VECTORS)
+                p = ax * bx + ay * by + az * bz
+                size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
+                value = tl.where(p < 0, -size, size)
+                column = i * D.VECTORS - i * (i - 1) // 2 + j - i
+                y += value[:, None] * tl.load(weight + h * INNER + column, mask=h < D.HIDDEN, other=0.0)[None, :]
+    for first in range(0, D.COLUMNS, D.K):
+        k = first + tl.arange(0, D.K)
+        inside = in_range[:, None] & (k[None, :] < D.COLUMNS)
+        part = tl.load(rows.x + r[:, None] * D.COLUMNS + k[None, :], mask=inside, other=0.0)
+        if ACTIVE:
+            if rows.offset is not None:
+                at = rows.offset + (r // rows.each)[:, None] * D.COLUMNS + k[None, :]
+                part += tl.load(at, mask=inside, other=0.0)
+            part = part * tl.sigmoid(part)
+        W = tl.load(weight + h[None, :] * INNER + PRODUCTS + k[:, None],
+                    mask=(k[:, None] < D.COLUMNS) & (h[None, :] < D.HIDDEN), other=0.0)  # fmt: skip
+        y += tl.dot(part, W, input_precision=PRECISION)
+    y += tl.load(bias + h, mask=h < D.HIDDEN, other=0.0)[None, :]
+    if rows.offset is not None and not ACTIVE:
+        wide = in_range[:, None] & (h[None, :] < D.HIDDEN)
+        y += tl.load(rows.offset + (r // rows.each)[:, None] * D.HIDDEN + h[None, :], mask=wide, other=0.0)
+    return y
+
+
+@triton.jit
+def _perceptron(rows, layers, out, ACTIVE: tl.constexpr, D: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr):
+    """Rows BLOCK at a time; `layers` (weight, bias) are the first, the second of three or None, and the last."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    in_range = r < rows
-    o, h = tl.arange(0, O), tl.arange(0, H)
-    to, store = out + r[:, None] * OUTER + o[None, :], in_range[:, None] & (o[None, :] < OUTER)
+    in_range = r < rows.count
+    O: tl.constexpr = D.O
+    o = tl.arange(0, O)
+    to, store = out + r[:, None] * D.OUTER + o[None, :], in_range[:, None] & (o[None, :] < D.OUTER)
     needed = BLOCK
-    if NEAR:
-        needed = tl.sum(tl.load(near + r, mask=in_range, other=0).to(tl.int32))
+    if rows.needed is not None:
+        needed = tl.sum(tl.load(rows.needed + r, mask=in_range, other=0).to(tl.int32))
     if needed == 0:
         tl.store(to, tl.zeros([BLOCK, O], tl.float32), mask=store)
     else:
-        PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
-        INNER: tl.constexpr = PRODUCTS + COLUMNS
-        y = tl.zeros([BLOCK, H], tl.float32)
-        if VECTORS:
-            for i in range(VECTORS):  # not unrolled, to limit register use
-                ax, ay, az = _component(vectors, r, in_range, i, VECTORS)
-                for j in range(i, VECTORS):
-                    bx, by, bz = _component(vectors, r, in_range, j, VECTORS)
-                    p = ax * bx + ay * by + az * bz
-                    size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
-                    value = tl.where(p < 0, -size, size)
-                    column = i * VECTORS - i * (i - 1) // 2 + j - i
-                    y += value[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
-        for first in range(0, COLUMNS, K):
-            k = first + tl.arange(0, K)
-            inside = in_range[:, None] & (k[None, :] < COLUMNS)
-            part = tl.load(x + r[:, None] * COLUMNS + k[None, :], mask=inside, other=0.0)
-            if ACTIVE:
-                if KNOWN:
-                    part += tl.load(known + (r // each)[:, None] * COLUMNS + k[None, :], mask=inside, other=0.0)
-                part = part * tl.sigmoid(part)
-            W = tl.load(w0 + h[None, :] * INNER + PRODUCTS + k[:, None],
-                        mask=(k[:, None] < COLUMNS) & (h[None, :] < HIDDEN), other=0.0)  # fmt: skip
-            y += tl.dot(part, W, input_precision=PRECISION)
-        y += tl.load(b0 + h, mask=h < HIDDEN, other=0.0)[None, :]
-        if KNOWN and not ACTIVE:
-            wide = in_range[:, None] & (h[None, :] < HIDDEN)
-            y += tl.load(known + (r // each)[:, None] * HIDDEN + h[None, :], mask=wide, other=0.0)
-        if DEEP:
-            y = _layer(y, w1, b1, HIDDEN, MIDDLE, H, M, PRECISION)
-            y = _layer(y, w2, b2, MIDDLE, OUTER, M, O, PRECISION)
+        y = _first_layer(rows, r, in_range, layers[0], ACTIVE, D, PRECISION)
+        if layers[1] is not None:
+            y = _layer(y, layers[1], D.HIDDEN, D.MIDDLE, D.M, PRECISION)
+            y = _layer(y, layers[2], D.MIDDLE, D.OUTER, D.O, PRECISION)
         else:
-            y = _layer(y, w1, b1, HIDDEN, OUTER, H, O, PRECISION)
+            y = _layer(y, layers[2], D.HIDDEN, D.OUTER, D.O, PRECISION)
         tl.store(to, y, mask=store)
 
 
@@ -104,16 +137,15 @@ def _fused(
     out = x.new_empty(rows, widths[-1])
     if not rows:
         return out
-    columns = x.shape[1]
-    K, H, M, O = (max(16, triton.next_power_of_2(w)) for w in (min(columns, CHUNK), widths[0], widths[-2], widths[-1]))
+    inputs = _Rows(x, vectors, offset, needed, rows, 1 if offset is None else rows // len(offset))
+    numbers = 0 if vectors is None else vectors.shape[1], x.shape[1], widths[0], widths[-2], widths[-1]
+    padded = (max(16, triton.next_power_of_2(w)) for w in (min(x.shape[1], CHUNK), widths[0], widths[-2], widths[-1]))
+    first, *middle, last = zip(weights, biases, strict=True)
     precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
     block = 32 if rows <= SMALL_BLOCK_ROWS else 64
-    layers = [t for pair in zip(weights, biases, strict=True) for t in pair]
     _perceptron[(triton.cdiv(rows, block),)](
-        x, vectors, offset, needed, *layers[:4], *layers[-2:], out, rows, 1 if offset is None else rows // len(offset),
-        0 if vectors is None else vectors.shape[1], columns, widths[0], widths[-2], widths[-1], offset is not None,
-        needed is not None, active, len(weights) == 3, precision, block, K, H, M, O,
-    )  # fmt: skip
+        inputs, (first, middle[0] if middle else None, last), out, active, _Widths(*numbers, *padded), precision, block
+    )
     return out
 
 

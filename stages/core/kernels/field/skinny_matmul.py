@@ -10,13 +10,15 @@ from torch import Tensor
 
 from stages.core.kernels.operators import operator
 
-ROWS, CHUNK = 64, 128  # rows per program, and inner dimension read at a time
-MAX_COLUMNS = 16
+ROWS, CHUNK = tl.constexpr(64), tl.constexpr(128)  # rows per program, and inner dimension read at a time
+COLUMNS = tl.constexpr(16)  # c, padded
 
 
 @triton.jit
-def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
-    """Matrices (n, k) times columns high + low (c, k), in half precision with single-precision sums; out (c, n)."""
+def _skinny_matmul(A, columns, out, n, k, c):
+    """Matrices (n, k) times columns (a high and a low part, each (c, k)), in half precision with single-precision sums;
+    out (c, n)."""
+    high, low = columns
     blocks = tl.cdiv(n, ROWS)
     matrix, block = (tl.program_id(0) // blocks).to(tl.int64), tl.program_id(0) % blocks
     r, col = block * ROWS + tl.arange(0, ROWS), tl.arange(0, COLUMNS)
@@ -40,13 +42,13 @@ def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     """A (g, n, k) times the columns high + low (g, c, k), all in half precision: (g, c, n) in single precision."""
     g, n, k = A.shape
     out = torch.empty(g, high.shape[1], n, dtype=torch.float32, device=A.device)
-    blocks = (g * triton.cdiv(n, ROWS),)
-    _skinny_matmul[blocks](A, high, low, out, n, k, high.shape[1], ROWS, CHUNK, MAX_COLUMNS, num_stages=4)
+    blocks = (g * triton.cdiv(n, ROWS.value),)
+    _skinny_matmul[blocks](A, (high, low), out, n, k, high.shape[1], num_stages=4)
     return out
 
 
 def skinny_matmul(A: Tensor, x: Tensor) -> Tensor:
-    """A @ x in single precision, for A (..., n, k) in half precision and x (..., k, c) with c <= MAX_COLUMNS."""
+    """A @ x in single precision, for A (..., n, k) in half precision and x (..., k, c) with c <= COLUMNS."""
     columns = x.flatten(0, -3).mT
     scale = columns.abs().amax(-1, keepdim=True).clamp_min(1e-30) / 1024
     columns = (columns / scale).contiguous()

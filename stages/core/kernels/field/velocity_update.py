@@ -5,8 +5,11 @@
 `stages.core.models.field.force_field`. Written in Triton (see `compilers`).
 """
 
+from typing import NamedTuple
+
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from stages.core.kernels.field.bodies import (
     ARM,
@@ -27,6 +30,7 @@ from stages.core.kernels.field.bodies import (
     clamp_displacements,
 )
 from stages.core.kernels.field.broad_phase import other_object
+from stages.core.kernels.field.layers import ROWS
 from stages.core.kernels.field.vec3 import (
     add,
     cross,
@@ -49,6 +53,23 @@ from stages.core.kernels.field.vec3 import (
 )
 
 
+class SplitFields(NamedTuple):
+    """Contact acceleration, displacement and its rate of the keypoints in the body frame, for `split_matmul`: in units,
+    each the sum of two numbers in half precision.
+    """
+
+    high: Tensor  # (b o, 9, n)
+    low: Tensor  # (b o, 9, n)
+    unit: Tensor  # (b o, 9)
+
+
+class ExternalWrench(NamedTuple):
+    """External force on each object, and torque about its centre of mass."""
+
+    force: Tensor  # (b o 3) [N]
+    torque: Tensor  # (b o 3) [N m]
+
+
 @triton.jit
 def _total(parts, blocks, BLOCKS: tl.constexpr):
     """Sum of force and torque over consecutive blocks of contact points."""
@@ -58,32 +79,35 @@ def _total(parts, blocks, BLOCKS: tl.constexpr):
 
 
 @triton.jit
-def _contact(
-    i, body, parts, accelerations, mass, pinned, o, n, places, wide, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
-):  # fmt: skip
+def _contact(i, inputs, drifted, lists, wrenches):
     """Force, torque and accelerations of the points of an object, per unit of mass, summed over its contacts."""
+    o, n = inputs.o, inputs.n
     first, index, m, kinds = i - i % o, i % o, o - 1, o + 1
-    c = read3(body + BODY_SIZE * i + COM)
-    mass_i, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
-    r = tl.arange(0, BLOCK)
-    zero = tl.zeros([BLOCK], tl.float32)
+    places, wide = lists.slots // ROWS, lists.wide // ROWS
+    c = read3(drifted.body + BODY_SIZE * i + COM)
+    mass_i, free = tl.maximum(tl.load(inputs.mass + i), 1e-6), 1 - tl.load(inputs.pinned + i).to(tl.float32)
+    r = tl.arange(0, inputs.BLOCK)
+    zero = tl.zeros([inputs.BLOCK], tl.float32)
     acceleration, force, torque = (zero, zero, zero), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(m):
         j = first + k + (k >= index)
         index_in_j = index - (index > j - first)  # index of i among the other objects of j
-        mass_j, free_j = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
+        mass_j = tl.maximum(tl.load(inputs.mass + j), 1e-6)
+        free_j = 1 - tl.load(inputs.pinned + j).to(tl.float32)
         reduced = 1 / tl.maximum(free / mass_i + free_j / mass_j, 1e-9)
-        F, T = _total(parts + (i * places + k * wide) * WRENCH_SIZE, wide, BLOCKS)
-        F_j, T_j = _total(parts + (j * places + index_in_j * wide) * WRENCH_SIZE, wide, BLOCKS)
-        T_j = add(T_j, cross(sub(read3(body + BODY_SIZE * j + COM), c), F_j))
+        own, others = (i * places + k * wide) * WRENCH_SIZE, (j * places + index_in_j * wide) * WRENCH_SIZE
+        F, T = _total(wrenches + own, wide, lists.PLANE_BLOCKS)
+        F_j, T_j = _total(wrenches + others, wide, lists.PLANE_BLOCKS)
+        T_j = add(T_j, cross(sub(read3(drifted.body + BODY_SIZE * j + COM), c), F_j))
         ratio = reduced / mass_i
         force, torque = add(force, scale3(ratio, sub(F, F_j))), add(torque, scale3(ratio, sub(T, T_j)))
-        of_contact = load3(accelerations + (i * kinds + k) * 3 * n + r, n, r < n)
+        of_contact = load3(lists.acceleration + (i * kinds + k) * 3 * n + r, n, r < n)
         acceleration = add(acceleration, scale3(ratio, of_contact))
-    F, T = _total(parts + (i * places + m * wide) * WRENCH_SIZE, places - m * wide, BLOCKS)  # floor and walls
+    planes = wrenches + (i * places + m * wide) * WRENCH_SIZE  # floor and walls
+    F, T = _total(planes, places - m * wide, lists.PLANE_BLOCKS)
     force, torque = add(force, F), add(torque, T)
-    acceleration = add(acceleration, load3(accelerations + (i * kinds + m) * 3 * n + r, n, r < n))
-    acceleration = add(acceleration, load3(accelerations + (i * kinds + m + 1) * 3 * n + r, n, r < n))
+    acceleration = add(acceleration, load3(lists.acceleration + (i * kinds + m) * 3 * n + r, n, r < n))
+    acceleration = add(acceleration, load3(lists.acceleration + (i * kinds + m + 1) * 3 * n + r, n, r < n))
     return force, torque, acceleration
 
 
@@ -94,71 +118,62 @@ def _limited(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
 
 
 @triton.jit
-def update_velocities(
-    body, moved, field, parts, accelerations, friction, unit, external_force, external_torque, arm, valid,
-    mass_fraction, size, mass, inverse, pinned,
-    gravity, box, com, quat, velocity, momentum, high, low, scale, o, n, dt, places, wide,
-    CONTACT_SATURATION: tl.constexpr, HAS_EXTERNAL: tl.constexpr, MAX_PENETRATION: tl.constexpr,
-    MAX_RECOVERY_SPEED: tl.constexpr, MAX_SPEED: tl.constexpr, MAX_SPIN: tl.constexpr,
-    FRICTION_CUTOFF_SPEED: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
-):  # fmt: skip
+def update_velocities(inputs, drifted, lists, messages, external, new, split, C: tl.constexpr):
     """Update velocities by the forces, drift by dt / 2, and prepare the neighbourhood averages of the points.
 
-    `parts`: force and torque of blocks of contact points, `wide` blocks for each other object and `places` in all;
-    `accelerations`: of each point by each contact (both from `contact_messages`). `high`, `low`, `scale`: contact
-    acceleration, displacement and its rate, split for `skinny_matmul`.
+    Writes poses and motion of the bodies of the BodyState `new`, and `split`; `external` may be None.
     """
-    i = tl.program_id(0)
-    force, torque, acceleration = _contact(i, body, parts, accelerations, mass, pinned, o, n, places, wide, BLOCK,
-                                           BLOCKS)  # fmt: skip
-    force = add(force, read3(gravity + 3 * (i // o)))
-    if HAS_EXTERNAL:
-        mass_i = tl.maximum(tl.load(mass + i), 1e-6)
-        force = add(force, scale3(1 / mass_i, read3(external_force + 3 * i)))
-        torque = add(torque, scale3(1 / mass_i, read3(external_torque + 3 * i)))
-    own_body = body + BODY_SIZE * i
+    i, o, n, dt = tl.program_id(0), inputs.o, inputs.n, inputs.dt
+    force, torque, acceleration = _contact(i, inputs, drifted, lists, messages.wrenches)
+    force = add(force, read3(inputs.gravity + 3 * (i // o)))
+    if external is not None:
+        mass_i = tl.maximum(tl.load(inputs.mass + i), 1e-6)
+        force = add(force, scale3(1 / mass_i, read3(external.force + 3 * i)))
+        torque = add(torque, scale3(1 / mass_i, read3(external.torque + 3 * i)))
+    own_body = drifted.body + BODY_SIZE * i
     past_v = read3(own_body + VELOCITY)
     past_spin = matvec3(read9(own_body + INVERSE_INERTIA), read3(own_body + MOMENTUM))
     L = add(read3(own_body + MOMENTUM), scale3(dt, torque))
     v = add(past_v, scale3(dt, force))
     spin = matvec3(read9(own_body + INVERSE_INERTIA), L)
-    spin_limit = MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), MAX_SPIN)
+    spin_limit = C.MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), C.MAX_SPIN)
     L, spin = scale3(spin_limit, L), scale3(spin_limit, spin)
-    v = scale3(MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), MAX_SPEED), v)
-    extent, friction_speed = tl.load(size + i), tl.load(friction + i)
+    v = scale3(C.MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), C.MAX_SPEED), v)
+    extent, friction_speed = tl.load(inputs.size + i), tl.load(messages.friction + i)
     for k in range(o - 1):  # friction of the support is passed on to what it carries
-        contact_weight = 1 - CONTACT_SATURATION * tl.load(unit + i * (o + 1) + k)  # saturates at 1
-        friction_speed = tl.maximum(friction_speed, contact_weight * tl.load(friction + other_object(i, k, o)))
-    last = (dot(v, v) + extent * extent * dot(spin, spin)) / FRICTION_CUTOFF_SPEED
+        contact_weight = 1 - C.CONTACT_SATURATION * tl.load(messages.scale + i * (o + 1) + k)  # saturates at 1
+        other_speed = tl.load(messages.friction + other_object(i, k, o))
+        friction_speed = tl.maximum(friction_speed, contact_weight * other_speed)
+    last = (dot(v, v) + extent * extent * dot(spin, spin)) / C.FRICTION_CUTOFF_SPEED
     past_v, past_spin = add(past_v, v), add(past_spin, spin)
     moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
-    drag = dt / FRAME * friction_speed * friction_speed * friction_speed * friction_speed
+    drag = dt / C.FRAME * friction_speed * friction_speed * friction_speed * friction_speed
     factor = (moving * moving + 1e-16) / (moving * moving + 1e-16 + drag)
     v, L, spin = scale3(factor, v), scale3(factor, L), scale3(factor, spin)
 
-    r = tl.arange(0, BLOCK)
+    r = tl.arange(0, inputs.BLOCK)
     inside = r < n
-    valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    at_point = moved + POINT_SIZE * i * n + r
+    valid_points = tl.load(inputs.valid + i * n + r, mask=inside, other=0) != 0
+    at_point = drifted.points + POINT_SIZE * i * n + r
     x = add(load3(at_point + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(at_point + ARM * n, n, inside))))
     infinity: tl.constexpr = float("inf")
-    bounds = box + 6 * i
-    slack = (MAX_PENETRATION, MAX_PENETRATION, MAX_PENETRATION)
+    bounds = inputs.box + 6 * i
+    slack = (C.MAX_PENETRATION, C.MAX_PENETRATION, C.MAX_PENETRATION)
     deepest = max3(where3(valid_points, scale3(-1.0, x), -infinity))  # positions of the lowest points, negated [m]
     up = scale3(2 / dt, sub(add(read3(bounds), deepest), slack))
     down = scale3(2 / dt, add(sub(read3(bounds + 3), max3(where3(valid_points, x, -infinity))), slack))
-    free = 1 - tl.load(pinned + i).to(tl.float32)
-    v = (_limited(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _limited(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
-         _limited(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
+    free = 1 - tl.load(inputs.pinned + i).to(tl.float32)
+    v = (_limited(v[0], up[0], down[0], C.MAX_RECOVERY_SPEED), _limited(v[1], up[1], down[1], C.MAX_RECOVERY_SPEED),
+         _limited(v[2], up[2], down[2], C.MAX_RECOVERY_SPEED))  # fmt: skip
     v = scale3(free, v)
     L = scale3(free, L)
-    c, q = drift(read3(own_body + COM), read4(own_body + QUAT), v, L, read9(inverse + 9 * i), dt / 2)
-    write3(com + 3 * i, c)
-    write4(quat + 4 * i, q)
-    write3(velocity + 3 * i, v)
-    write3(momentum + 3 * i, L)
+    c, q = drift(read3(own_body + COM), read4(own_body + QUAT), v, L, read9(inputs.inverse + 9 * i), dt / 2)
+    write3(new.com + 3 * i, c)
+    write4(new.quat + 4 * i, q)
+    write3(new.velocity + 3 * i, v)
+    write3(new.momentum + 3 * i, L)
 
-    part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
+    part = tl.load(inputs.mass_fraction + i * n + r, mask=inside, other=0.0)
     inverse_fraction = tl.where(valid_points, 1 / tl.maximum(part, 1e-9), 0.0)
     acceleration = (
         inverse_fraction * acceleration[0],
@@ -166,14 +181,12 @@ def update_velocities(
         inverse_fraction * acceleration[2],
     )
     acceleration = transposed_matvec3(read9(own_body + ROTATION), acceleration)
-    arms = load3(arm + (i * n + r) * 3, 1, inside)
-    at_point = field + FIELD_SIZE * i * n + r
+    arms = load3(inputs.arm + (i * n + r) * 3, 1, inside)
+    at_point = drifted.field + FIELD_SIZE * i * n + r
     store3(at_point + VIRIAL * n, n, _spread(acceleration, arms, part, extent), inside)
-    _split(acceleration, high + 9 * i * n + r, low + 9 * i * n + r, scale + 9 * i, n, inside)
-    displacement = load3(at_point + U * n, n, inside)
-    _split(displacement, high + (9 * i + 3) * n + r, low + (9 * i + 3) * n + r, scale + 9 * i + 3, n, inside)
-    rate = load3(at_point + DU * n, n, inside)
-    _split(rate, high + (9 * i + 6) * n + r, low + (9 * i + 6) * n + r, scale + 9 * i + 6, n, inside)
+    _split(acceleration, split, 9 * i, n, inside)
+    _split(load3(at_point + U * n, n, inside), split, 9 * i + 3, n, inside)
+    _split(load3(at_point + DU * n, n, inside), split, 9 * i + 6, n, inside)
 
 
 @triton.jit
@@ -186,43 +199,43 @@ def _spread(acceleration, arm, mass_fraction, size):
 
 
 @triton.jit
-def _split(a, high, low, scale, n, mask):
-    """Write vectors as sums of two half-precision parts (22 bits), in units in which the largest is 1,024."""
+def _split(a, to, row, n, mask):
+    """Write vectors to three rows of SplitFields, in units in which the largest component is 1,024."""
     largest = max3((tl.abs(a[0]), tl.abs(a[1]), tl.abs(a[2])))
+    at = row * n + tl.arange(0, a[0].shape[0])
     for axis in tl.static_range(3):
         unit = tl.maximum(largest[axis], 1e-30) / 1024
         x = a[axis] / unit
         half = x.to(tl.float16)
-        tl.store(high + axis * n, half, mask=mask)
-        tl.store(low + axis * n, (x - half.to(tl.float32)).to(tl.float16), mask=mask)
-        tl.store(scale + axis, unit)
+        tl.store(to.high + axis * n + at, half, mask=mask)
+        tl.store(to.low + axis * n + at, (x - half.to(tl.float32)).to(tl.float16), mask=mask)
+        tl.store(to.unit + row + axis, unit)
 
 
 @triton.jit
-def update_displacements(
-    field, acceleration, arm, valid, mass_fraction, size, inverse, stiffness, damping, pinned, u, du, n, dt,
-    MAX_SPEED: tl.constexpr, MAX_DISPLACEMENT: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Update displacements and their rates by internal accelerations, after removing their mean and net rotation."""
-    i = tl.program_id(0)
-    r = tl.arange(0, BLOCK)
+def update_displacements(inputs, drifted, acceleration, new, C: tl.constexpr):
+    """Update displacements and their rates (of `new`) by internal accelerations (b o, 3, n), after removing the mean
+    and the net rotation of these."""
+    i, n, dt = tl.program_id(0), inputs.n, inputs.dt
+    r = tl.arange(0, inputs.BLOCK)
     inside = r < n
-    valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
-    arms = load3(arm + (i * n + r) * 3, 1, inside)
+    valid_points = tl.load(inputs.valid + i * n + r, mask=inside, other=0) != 0
+    part = tl.load(inputs.mass_fraction + i * n + r, mask=inside, other=0.0)
+    arms = load3(inputs.arm + (i * n + r) * 3, 1, inside)
     a = load3(acceleration + 3 * i * n + r, n, inside)
     a = sub(a, sum3(scale3(part, a)))
-    rotation_rate = matvec3(read9(inverse + 9 * i), sum3(scale3(part, cross(arms, a))))
+    rotation_rate = matvec3(read9(inputs.keypoint_inverse + 9 * i), sum3(scale3(part, cross(arms, a))))
     a = sub(a, cross(rotation_rate, arms))
     a = where3(valid_points, a, 0.0)
-    at_point = field + FIELD_SIZE * i * n + r
+    at_point = drifted.field + FIELD_SIZE * i * n + r
     displacement, rate = load3(at_point + U * n, n, inside), load3(at_point + DU * n, n, inside)
-    k, c, extent = tl.load(stiffness + i), tl.load(damping + i), tl.load(size + i)
+    k, c, extent = tl.load(inputs.stiffness + i), tl.load(inputs.damping + i), tl.load(inputs.size + i)
     rate = add(rate, scale3(dt, sub(a, scale3(k, displacement))))
     rate = scale3(1 / (1 + dt * c + dt * dt / 2 * k), rate)
-    free = 1 - tl.load(pinned + i).to(tl.float32)
-    rate = scale3(free, clamp_displacements(rate, MAX_SPEED * extent, MAX_DISPLACEMENT))
-    displacement = clamp_displacements(add(displacement, scale3(dt / 2, rate)), extent, MAX_DISPLACEMENT)
+    free = 1 - tl.load(inputs.pinned + i).to(tl.float32)
+    rate = scale3(free, clamp_displacements(rate, C.MAX_SPEED * extent, C.MAX_DISPLACEMENT))
+    displacement = add(displacement, scale3(dt / 2, rate))
+    displacement = clamp_displacements(displacement, extent, C.MAX_DISPLACEMENT)
     at = (i * n + r) * 3
-    store3(u + at, 1, displacement, inside)
-    store3(du + at, 1, rate, inside)
+    store3(new.u + at, 1, displacement, inside)
+    store3(new.du + at, 1, rate, inside)

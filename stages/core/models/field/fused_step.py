@@ -12,10 +12,10 @@ all z. Contact points of an object lie in one list: a segment for each other obj
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 import triton
+import triton.language as tl
 from torch import Tensor, nn
 
 from stages.core.kernels.field import (
@@ -24,13 +24,14 @@ from stages.core.kernels.field import (
     contact_features,
     contact_messages,
     deformation_features,
+    layers,
     skinny_matmul,
     velocity_update,
 )
 from stages.core.models.dynamics import FRAME
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field import contact_points as near
-from stages.core.models.field.contact_forces import ACCELERATION_UNIT, CONTACT_SATURATION
+from stages.core.models.field.contact_forces import ACCELERATION_UNIT, CONTACT_SATURATION, ContactNet
 from stages.core.models.field.deformation import MAX_DAMPER_WEIGHT, MAX_DISPLACEMENT, MAX_SPRING_WEIGHT
 from stages.core.models.field.floor_response import (
     FRICTION_CUTOFF_SPEED,
@@ -42,7 +43,16 @@ from stages.core.models.field.floor_response import (
 from stages.core.models.field.state import MAX_SPEED, MAX_SPIN, BodyState, FieldScene
 
 MAX_KEYPOINTS = 4096  # of an object: a kernel holds all of them in registers
-ROWS = 64  # contact points or keypoints of a block
+ROWS = layers.ROWS.value  # contact points or keypoints of a block
+CONSTANTS = bodies.FieldConstants(
+    FRAME=FRAME, SEARCH_RADIUS=near.SEARCH_RADIUS, NO_CONTACT=near.NO_CONTACT, FULL_CONTACT=near.FULL_CONTACT,
+    PAIR_FRACTION=near.PAIR_FRACTION, WALL_FRACTION=near.WALL_FRACTION, GAP_UNIT=near.GAP_UNIT,
+    ARM_UNIT=near.ARM_UNIT, CONTACT_SATURATION=CONTACT_SATURATION, ACCELERATION_UNIT=ACCELERATION_UNIT,
+    SEPARATION_SPEED=SEPARATION_SPEED, MAX_FRICTION_SPEED=MAX_FRICTION_SPEED,
+    FRICTION_CUTOFF_SPEED=FRICTION_CUTOFF_SPEED, MAX_PENETRATION=MAX_PENETRATION,
+    MAX_RECOVERY_SPEED=MAX_RECOVERY_SPEED, MAX_SPEED=MAX_SPEED, MAX_SPIN=MAX_SPIN, MAX_DISPLACEMENT=MAX_DISPLACEMENT,
+    MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT,
+)  # fmt: skip
 
 
 def fits(field: nn.Module, scene: FieldScene) -> bool:
@@ -63,9 +73,9 @@ def step(
 def points(scene: FieldScene, state: BodyState) -> Tensor:
     """Positions of the keypoints (b o n 3) [m], as `ForceField.points`."""
     b, o, n, _ = state.u.shape
-    inputs = [x.contiguous() for x in (state.com, state.quat, state.u, scene.shape.arm)]
-    out = torch.empty_like(inputs[2])
-    bodies.world_points[(b * o, triton.cdiv(n, 256))](*inputs, out, n, BLOCK=256)
+    state = BodyState(*(x.contiguous() for x in state))
+    out = torch.empty_like(state.u)
+    bodies.world_points[(b * o, triton.cdiv(n, 256))](state, scene.shape.arm.contiguous(), out, n, BLOCK=256)
     return out
 
 
@@ -75,192 +85,150 @@ def segment_sizes(o: int, n: int) -> list[int]:
     return [ROWS * math.ceil(fraction * n / ROWS) for fraction in fractions]
 
 
-def _layers(*layers: nn.Linear) -> tuple[Tensor, ...]:
-    """Weight and bias of each layer."""
-    return tuple(x for layer in layers for x in (layer.weight, layer.bias))
+def _linear(layer: nn.Linear) -> tuple[Tensor, Tensor]:
+    return layer.weight, layer.bias
 
 
-class _Kinematics(NamedTuple):
-    """Bodies and keypoints after half a drift, in the layout of kernels/field/bodies.py."""
-
-    body: Tensor
-    point_states: Tensor
-    deformation: Tensor
-    planes: Tensor  # distances of the keypoints from floor and walls, as sort keys
+def _network(layers: nn.Sequential) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Weight and bias of each linear layer."""
+    return tuple(_linear(x) for x in layers if isinstance(x, nn.Linear))
 
 
-class _Contacts(NamedTuple):
-    """Contact points: their number in each segment, their keypoints, forces at keypoints and input features."""
+def _contact_layers(net: ContactNet, vectors: int, scalars: int) -> contact_messages.ContactLayers:
+    return contact_messages.ContactLayers(
+        own_projection=_linear(net.own_projection),
+        partner_projection=net.partner_projection and _linear(net.partner_projection),
+        input_layer=_linear(net.input_layer), message=_network(net.message),
+        context_projection=_linear(net.context_projection), decoder=_network(net.decoder),
+        VECTORS=tl.constexpr(vectors), SCALARS=tl.constexpr(scalars),
+    )  # fmt: skip
 
-    count: Tensor
-    point: Tensor
-    local_forces: Tensor
-    record: Tensor
 
-
-class _ContactEffect(NamedTuple):
-    """What the contact messages give: an offset to the networks' first layers, wrenches and friction of each object."""
-
-    offset: Tensor
-    wrenches: Tensor
-    friction: Tensor
-    scale: Tensor
+def _field_layers(field: nn.Module) -> contact_messages.FieldLayers:
+    precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
+    deformation = field.deformation
+    return contact_messages.FieldLayers(
+        pairs=_contact_layers(field.pairs, 10, 7), planes=_contact_layers(field.planes, 8, 5),
+        object_update=_network(field.object_update), pair_update=_network(field.pair_update),
+        plane_update=_network(field.plane_update), friction=_linear(field.friction),
+        embedding_projection=_linear(deformation.embedding_projection),
+        deformation_input=_linear(deformation.input_layer), deformation_decoder=_network(deformation.decoder),
+        H=tl.constexpr(field.config["hidden"]), PRECISION=tl.constexpr(precision),
+    )  # fmt: skip
 
 
 class _Step:
     """Sizes, contiguous inputs and the four groups of kernel launches of one step."""
 
     def __init__(self, field: nn.Module, scene: FieldScene, external: ExternalForces, dt: float):
-        self.field, self.scene, self.external, self.dt = field, scene, external, dt
+        self.scene, self.external = scene, external
         self.b, self.o, self.n, _ = scene.shape.arm.shape
-        self.objects, self.kinds, self.hidden = self.b * self.o, self.o + 1, field.config["hidden"]
-        for name in ("arm", "normal", "spacing", "size", "inverse", "keypoint_inverse"):
-            setattr(self, name, getattr(scene.shape, name).contiguous())
-        for name in ("valid", "mass_fraction", "mass", "gravity", "box"):
-            setattr(self, name, getattr(scene.shape.initial, name).contiguous())
-        self.embedding, self.pinned = scene.embedding.contiguous(), external.pinned.contiguous()
-
-        *others, floor, narrow = segment_sizes(self.o, self.n)
-        wide, self.slots = others[0] if others else floor, sum(others) + floor + narrow
-        self.segments = (self.o, self.n, wide, narrow, self.slots)
-        self.blocks, self.floor, self.wide = self.slots // ROWS, floor // ROWS, wide // ROWS  # numbers of blocks
-        self.whole = {"BLOCK": max(64, triton.next_power_of_2(self.n)), "num_warps": 8}
-        precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
-        self.network = {"ROWS": ROWS, "H": self.hidden, "PRECISION": precision}
+        self.objects = self.b * self.o
+        shape, initial = scene.shape, scene.shape.initial
+        arrays = {
+            "arm": shape.arm, "normal": shape.normal, "valid": initial.valid, "mass_fraction": initial.mass_fraction,
+            "spacing": shape.spacing, "size": shape.size, "mass": initial.mass, "inverse": shape.inverse,
+            "keypoint_inverse": shape.keypoint_inverse, "pinned": external.pinned, "box": initial.box,
+            "gravity": initial.gravity, "embedding": scene.embedding, "stiffness": scene.stiffness,
+            "damping": scene.damping, "compliance_scale": scene.compliance_scale,
+        }  # fmt: skip
+        arrays = {name: x.contiguous() for name, x in arrays.items()}
+        block = tl.constexpr(max(64, triton.next_power_of_2(self.n)))
+        self.inputs = bodies.StepInputs(**arrays, o=self.o, n=self.n, dt=dt, BLOCK=block)
+        self.layers = _field_layers(field)
+        self.segments = segment_sizes(self.o, self.n)
+        self.blocks = sum(self.segments) // ROWS
 
     def run(self, state: BodyState, t: Tensor | float) -> BodyState:
         drifted = self._drift(state)
-        contacts = self._contacts(drifted)
-        effect = self._messages(contacts)
-        # without external forces the kernel takes these arguments but does not read them
-        wrench = effect.friction, effect.scale
+        lists = self._contacts(drifted)
+        messages = self._messages(lists)
+        wrench = None
         if self.external.object.shape[1]:
-            positions, com = drifted.point_states[:, :, :3].mT, drifted.body[..., :3].contiguous()
-            wrench = self.external.wrench(positions, com, t, self.dt)
-        return self._update(drifted, contacts.local_forces, effect, wrench)
+            positions, com = drifted.points[:, :, :3].mT, drifted.body[..., :3].contiguous()
+            wrench = velocity_update.ExternalWrench(*self.external.wrench(positions, com, t, self.inputs.dt))
+        return self._update(drifted, lists, messages, wrench)
 
     def _new(self, *shape: int) -> Tensor:
-        return self.arm.new_empty(self.b, self.o, *shape)
+        return self.inputs.arm.new_empty(self.b, self.o, *shape)
 
     def _count(self, *shape: int) -> Tensor:
-        return torch.empty(self.b, self.o, *shape, dtype=torch.int32, device=self.arm.device)
+        return torch.empty(self.b, self.o, *shape, dtype=torch.int32, device=self.inputs.arm.device)
 
-    def _drift(self, state: BodyState) -> _Kinematics:
-        body, point_states = self._new(bodies.BODY_SIZE.value), self._new(bodies.POINT_SIZE.value, self.n)
-        deformation, planes = self._new(bodies.FIELD_SIZE.value, self.n), self._new(2, self.n)
-        bodies.drift_half_step[(self.objects,)](
-            *(x.contiguous() for x in state), self.arm, self.normal, self.valid, self.size, self.inverse, self.pinned,
-            self.box, body, point_states, deformation, planes, self.o, self.n, self.dt,
-            MAX_DISPLACEMENT=MAX_DISPLACEMENT, NO_CONTACT=near.NO_CONTACT, FRAME=FRAME, **self.whole,
+    def _drift(self, state: BodyState) -> bodies.Kinematics:
+        widths = bodies.POINT_SIZE.value, bodies.FIELD_SIZE.value, 2
+        drifted = bodies.Kinematics(self._new(bodies.BODY_SIZE.value), *(self._new(k, self.n) for k in widths))
+        state = BodyState(*(x.contiguous() for x in state))
+        bodies.drift_half_step[(self.objects,)](state, self.inputs, drifted, CONSTANTS, num_warps=8)
+        return drifted
+
+    def _contacts(self, drifted: bodies.Kinematics) -> broad_phase.ContactLists:
+        n, m, kinds = self.n, self.o - 1, self.o + 1
+        candidates = broad_phase.NearPoints(
+            position=self._new(m, 3, n), which=self._count(m, n), count=self._count(m), key=self._new(m, n),
+            partner=self._count(m, n),
         )  # fmt: skip
-        return _Kinematics(body, point_states, deformation, planes)
-
-    def _contacts(self, drifted: _Kinematics) -> _Contacts:
-        body, point_states, _, planes = drifted
-        o, n, m = self.o, self.n, self.o - 1
-        candidates, keys, which, partner = self._new(m, 3, n), self._new(m, n), self._count(m, n), self._count(m, n)
-        candidate_count = self._count(m)
         if m:
-            broad_phase.gather_candidates[(self.objects, m)](
-                body, point_states, self.valid, candidates, which, candidate_count, o, n,
-                SEARCH_RADIUS=near.SEARCH_RADIUS, **self.whole,
-            )  # fmt: skip
-            broad_phase.nearest_candidates[(self.objects * m, triton.cdiv(n, broad_phase.QUERY_BLOCK))](
-                body, point_states, candidates, which, candidate_count, keys, partner, o, n,
-                SEARCH_RADIUS=near.SEARCH_RADIUS, FRAME=FRAME, QUERY_BLOCK=broad_phase.QUERY_BLOCK,
-                CANDIDATE_CHUNK=broad_phase.CANDIDATE_CHUNK,
-            )  # fmt: skip
-        count, local_forces = self._count(self.kinds), self._new(self.kinds, 3, n)
-        point, partner_point = self._count(self.slots), self._count(self.slots)
-        broad_phase.select_contacts[(self.objects, self.kinds)](
-            keys, planes, which, partner, candidate_count, self.valid, count, point, partner_point, local_forces,
-            *self.segments, PAIR_FRACTION=near.PAIR_FRACTION, WALL_FRACTION=near.WALL_FRACTION,
-            NO_CONTACT=near.NO_CONTACT, **self.whole,
+            shared = self.inputs, drifted, candidates, CONSTANTS
+            broad_phase.gather_candidates[(self.objects, m)](*shared, num_warps=8)
+            blocks = triton.cdiv(n, broad_phase.QUERY_BLOCK.value)
+            broad_phase.nearest_candidates[(self.objects * m, blocks)](*shared)
+        *others, floor, narrow = self.segments
+        slots, wide = sum(self.segments), others[0] if others else floor
+        padded = [tl.constexpr(triton.next_power_of_2(k // ROWS)) for k in (floor, floor + narrow)]
+        lists = broad_phase.ContactLists(
+            count=self._count(kinds), point=self._count(slots), partner=self._count(slots),
+            record=self._new(slots * contact_features.COLUMNS.value), acceleration=self._new(kinds, 3, n),
+            wide=wide, narrow=narrow, slots=slots, FLOOR_BLOCKS=padded[0], PLANE_BLOCKS=padded[1],
         )  # fmt: skip
-        record = self._new(self.slots * contact_features.COLUMNS.value)
+        broad_phase.select_contacts[(self.objects, kinds)](
+            self.inputs, drifted, candidates, lists, CONSTANTS, num_warps=8
+        )
         contact_features.contact_features[(self.objects, self.blocks)](
-            body, point_states, count, point, partner_point, record, self.spacing, self.mass_fraction, self.size,
-            self.mass, self.gravity, self.box, *self.segments, FULL_CONTACT=near.FULL_CONTACT,
-            NO_CONTACT=near.NO_CONTACT, GAP_UNIT=near.GAP_UNIT, ARM_UNIT=near.ARM_UNIT, FRAME=FRAME, ROWS=ROWS,
-            num_warps=2,
-        )  # fmt: skip
-        return _Contacts(count, point, local_forces, record)
+            self.inputs, drifted, lists, CONSTANTS, num_warps=2
+        )
+        return lists
 
-    def _messages(self, contacts: _Contacts) -> _ContactEffect:
-        count, point, local_forces, record = contacts
-        field, pair, plane, h = self.field, self.field.pairs, self.field.planes, self.hidden
-        offset, context = self._new(self.kinds + 1, h), self._new(self.kinds, h)
-        projections = _layers(
-            pair.own_projection, pair.partner_projection, plane.own_projection, field.deformation.embedding_projection
+    def _messages(self, lists: broad_phase.ContactLists) -> contact_messages.Messages:
+        kinds, slots, h = self.o + 1, lists.slots, self.layers.H.value
+        messages = contact_messages.Messages(
+            offset=self._new(kinds + 1, h), message=self._new(slots, h), weight=self._new(slots),
+            block_sum=self._new(self.blocks, h), block_weight=self._new(self.blocks), mean=self._new(kinds, h),
+            scale=self._new(kinds), status=self._new(h), friction=self._new(), context=self._new(kinds, h),
+            wrenches=self._new(self.blocks, bodies.WRENCH_SIZE.value),
         )  # fmt: skip
-        contact_messages.project_embeddings[(self.objects, self.kinds + 1)](
-            self.embedding, *projections, offset, self.o, H=h
-        )  # fmt: skip
-        message, weight = self._new(self.slots, h), self._new(self.slots)
-        message_sum, total = self._new(self.blocks, h), self._new(self.blocks)
-        encoders = (_layers(net.input_layer, net.message[0], net.message[2]) for net in (pair, plane))
-        contact_messages.encode_messages[(self.objects, self.blocks)](
-            record, count, *encoders, offset, message, weight, message_sum, total, *self.segments, **self.network,
-        )  # fmt: skip
-        mean_message, scale, status = self._new(self.kinds, h), self._new(self.kinds), self._new(h)
-        friction = self._new()
-        contact_messages.aggregate_messages[(self.objects,)](
-            self.embedding, message_sum, total, _layers(field.object_update[0], field.object_update[2]),
-            *_layers(field.friction), mean_message, scale, status, friction, *self.segments,
-            CONTACT_SATURATION=CONTACT_SATURATION,
-            MAX_FRICTION_SPEED=MAX_FRICTION_SPEED, ROWS=ROWS, BLOCKS=triton.next_power_of_2(self.floor), H=h,
-            num_warps=8,
-        )  # fmt: skip
-        contact_messages.update_contacts[(self.objects, self.kinds)](
-            mean_message, status, _layers(field.pair_update[0], field.pair_update[2]),
-            _layers(field.plane_update[0], field.plane_update[2]),
-            *_layers(pair.context_projection, plane.context_projection), context, self.o, H=h,
-        )  # fmt: skip
-        wrenches = self._new(self.blocks, bodies.WRENCH_SIZE.value)
-        decoders = (_layers(net.decoder[0], net.decoder[2]) for net in (pair, plane))
-        contact_messages.decode_forces[(self.objects, self.blocks)](
-            record, count, point, *decoders, context, message, weight, scale, local_forces, wrenches, *self.segments,
-            ACCELERATION_UNIT=ACCELERATION_UNIT, SEPARATION_SPEED=SEPARATION_SPEED, GAP_UNIT=near.GAP_UNIT,
-            ARM_UNIT=near.ARM_UNIT, **self.network,
-        )  # fmt: skip
-        return _ContactEffect(offset, wrenches, friction, scale)
+        of_objects, of_lists, of_blocks = (self.objects,), (self.objects, kinds), (self.objects, self.blocks)
+        embeddings = self.objects, kinds + 1
+        contact_messages.project_embeddings[embeddings](self.inputs, self.layers, messages)
+        shared = self.inputs, lists, self.layers, messages
+        contact_messages.encode_messages[of_blocks](*shared)
+        contact_messages.aggregate_messages[of_objects](*shared, CONSTANTS, num_warps=8)
+        contact_messages.update_contacts[of_lists](self.inputs, self.layers, messages)
+        contact_messages.decode_forces[of_blocks](*shared, CONSTANTS)
+        return messages
 
     def _update(
-        self, drifted: _Kinematics, local_forces: Tensor, effect: _ContactEffect, wrench: tuple[Tensor, Tensor]
-    ) -> BodyState:
-        body, point_states, deformation, _ = drifted
-        o, n, scene, net = self.o, self.n, self.scene, self.field.deformation
-        com, quat, velocity, momentum = (self._new(width) for width in (3, 4, 3, 3))
-        high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
-        scale = self._new(9)
+        self, drifted: bodies.Kinematics, lists: broad_phase.ContactLists, messages: contact_messages.Messages,
+        wrench: velocity_update.ExternalWrench | None,
+    ) -> BodyState:  # fmt: skip
+        n, inputs = self.n, self.inputs
+        new = BodyState(*(self._new(width) for width in (3, 4, 3, 3)), self._new(n, 3), self._new(n, 3))
+        halves = (torch.empty(self.b, self.o, 9, n, dtype=torch.float16, device=inputs.arm.device) for _ in range(2))
+        split = velocity_update.SplitFields(*halves, self._new(9))
         velocity_update.update_velocities[(self.objects,)](
-            body, point_states, deformation, effect.wrenches, local_forces, effect.friction, effect.scale, *wrench,
-            self.arm, self.valid, self.mass_fraction, self.size, self.mass, self.inverse, self.pinned, self.gravity,
-            self.box, com, quat, velocity, momentum, high, low, scale, o, n, self.dt, self.blocks, self.wide,
-            HAS_EXTERNAL=self.external.object.shape[1] > 0, CONTACT_SATURATION=CONTACT_SATURATION,
-            MAX_PENETRATION=MAX_PENETRATION, MAX_RECOVERY_SPEED=MAX_RECOVERY_SPEED, MAX_SPEED=MAX_SPEED,
-            MAX_SPIN=MAX_SPIN, FRICTION_CUTOFF_SPEED=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
-            BLOCKS=triton.next_power_of_2(self.blocks - (o - 1) * self.wide), **self.whole,
-        )  # fmt: skip
-        mean = skinny_matmul.split_matmul(
-            scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1)
+            inputs, drifted, lists, messages, wrench, new, split, CONSTANTS, num_warps=8
         )
+        weights = self.scene.shape.blur.flatten(0, 1).flatten(1, 2)
+        averages = skinny_matmul.split_matmul(weights, split.high.flatten(0, 1), split.low.flatten(0, 1))
         blocks = triton.cdiv(n, ROWS)
-        record, field = self._new(blocks, deformation_features.FEATURE_COLUMNS.value, ROWS), self._new(3, n)
-        deformation_features.deformation_features[(self.objects, blocks)](
-            body, deformation, mean, scale, self.arm, self.normal, self.size, self.gravity, record, o, n, blocks,
-            ROWS=ROWS, num_warps=2,
-        )  # fmt: skip
-        deformation_features.internal_accelerations[(self.objects, blocks)](
-            record, effect.offset, scene.compliance_scale.contiguous(), _layers(net.input_layer),
-            _layers(net.decoder[0], net.decoder[2]), field, n, blocks, self.kinds,
-            MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT, **self.network,
-        )  # fmt: skip
-        u, du = self._new(n, 3), self._new(n, 3)
-        stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()
+        of_blocks = self.objects, blocks
+        record = self._new(blocks, deformation_features.FEATURE_COLUMNS.value, ROWS)
+        acceleration = self._new(3, n)
+        deformation_features.deformation_features[of_blocks](inputs, drifted, averages, split.unit, record, num_warps=2)
+        deformation_features.internal_accelerations[of_blocks](
+            inputs, record, self.layers, messages.offset, acceleration, CONSTANTS
+        )
         velocity_update.update_displacements[(self.objects,)](
-            deformation, field, self.arm, self.valid, self.mass_fraction, self.size, self.keypoint_inverse, stiffness,
-            damping, self.pinned, u, du, n, self.dt, MAX_SPEED=MAX_SPEED, MAX_DISPLACEMENT=MAX_DISPLACEMENT,
-            **self.whole,
-        )  # fmt: skip
-        return BodyState(com, quat, velocity, momentum, u, du)
+            inputs, drifted, acceleration, new, CONSTANTS, num_warps=8
+        )
+        return new

@@ -23,7 +23,7 @@ if (k > 9) {
 }
 F rgb[3] = {(F)(0.5f), (F)(0.5f), (F)(0.5f)};
 for (int i = 0; i < k; ++i)
-    for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(sh.data, 3 * k, 3 * i + c);
+    for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(gaussians.sh.data, 3 * k, 3 * i + c);
 """
 """In: means m, camera centre cam[16..18], k coefficients. Out: unit direction d, basis Y, colour rgb (not clamped)."""
 
@@ -33,8 +33,8 @@ for (int c = 0; c < 3; ++c) vrgb[c] = rgb[c] >= 0 ? slot(6 + c) : none;
 for (int i = 0; i < k; ++i) {
     vY[i] = none;
     for (int c = 0; c < 3; ++c) {
-        vY[i] += vrgb[c] * gather(sh.data, 3 * k, 3 * i + c);
-        scatter(v_sh.data, 3 * k, 3 * i + c, Y[i] * vrgb[c]);
+        vY[i] += vrgb[c] * gather(gaussians.sh.data, 3 * k, 3 * i + c);
+        scatter(v_gaussians.sh.data, 3 * k, 3 * i + c, Y[i] * vrgb[c]);
     }
 }
 F vd[3] = {none, none, none};

@@ -7,6 +7,8 @@ A splat, a projected Gaussian, is a row of 16 floats, one cache line:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import warp as wp
@@ -14,7 +16,7 @@ from torch import Tensor
 
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import matrix
-from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.interop import device_of, launch, view, with_arrays
 from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
 from stages.core.kernels.splat.simd import (
     LANES,
@@ -34,15 +36,45 @@ SPLAT_SIZE = 16  # floats in a splat
 BIN_SIZE = 32  # [px], side of a bin on a CPU
 TILE_SIZE = 16  # [px], side of a bin on CUDA: a thread per pixel, 256 in a block
 
+
+@wp.struct
+class GaussianArrays:
+    """The n Gaussians of a scene, or the gradients of the loss by them."""
+
+    means: wp.array2d[float]  # (n, 3) [m]
+    quats: wp.array2d[float]  # (n, 4), w x y z of any length
+    scales: wp.array2d[float]  # (n, 3) [m]
+    opacities: wp.array[float]  # (n,)
+    sh: wp.array3d[float]  # (n, k, 3), k = (degree + 1)**2
+
+
+@wp.struct
+class ProjectedSplats:
+    """The splats of n Gaussians, and where binning finds them."""
+
+    splats: wp.array2d[float]  # (n, 16)
+    keys: wp.array[int]  # (n,), bits of the depth, -1: not visible
+    rects: wp.array2d[wp.int16]  # (n, 4), first column and row and last ones of the bins
+
+
+@wp.struct
+class SplatGradients:
+    """Splats and the gradients of the loss by them."""
+
+    splats: wp.array2d[float]  # (n, 16)
+    grads: wp.array2d[float]  # (n, 16)
+
+
 # Rows of a group of Gaussians: 16 on a CPU, one on CUDA.
 _ROWS = by_device(
     SCALARS
     + r"""
-const int row = group;
+const int row = group, k = gaussians.sh.shape[1];
 auto gather = [row](const float* p, int stride, int column) { return p[(long long)row * stride + column]; };
 """,
     VECTORS
     + r"""
+const int n = gaussians.means.shape[0], k = gaussians.sh.shape[1];
 const int count = n - 16 * group < 16 ? n - 16 * group : 16;
 int row[16];
 for (int l = 0; l < 16; ++l) row[l] = 16 * group + (l < count ? l : 0);
@@ -58,7 +90,7 @@ auto gather = [&row](const float* p, int stride, int column) {
 _GEOMETRY = r"""
 const float* cam = camera.data;
 F m[3], p[3], q[4], s[3];
-for (int i = 0; i < 3; ++i) m[i] = gather(means.data, 3, i);
+for (int i = 0; i < 3; ++i) m[i] = gather(gaussians.means.data, 3, i);
 for (int i = 0; i < 3; ++i) p[i] = cam[3*i] * m[0] + cam[3*i+1] * m[1] + cam[3*i+2] * m[2] + cam[9+i];
 I visible = (p[2] >= cam[21]) & (p[2] < 1e10f);
 const float fx = cam[12], fy = cam[13];
@@ -67,13 +99,13 @@ F xz = p[0] * iz, yz = p[1] * iz;
 // far outside the image the Jacobian is evaluated at the limit, where the linearisation is still bounded
 F xc = vmin(vmax(xz, (F)(cam[22])), (F)(cam[23])), yc = vmin(vmax(yz, (F)(cam[24])), (F)(cam[25]));
 
-for (int i = 0; i < 4; ++i) q[i] = gather(quats.data, 4, i);
+for (int i = 0; i < 4; ++i) q[i] = gather(gaussians.quats.data, 4, i);
 F iq = 1.0f / vsqrt(q[0]*q[0] + q[1]*q[1] + q[2]*q[2] + q[3]*q[3]);
 for (int i = 0; i < 4; ++i) q[i] *= iq;
 F R[9] = {1 - 2*(q[2]*q[2] + q[3]*q[3]), 2*(q[1]*q[2] - q[0]*q[3]), 2*(q[1]*q[3] + q[0]*q[2]),
           2*(q[1]*q[2] + q[0]*q[3]), 1 - 2*(q[1]*q[1] + q[3]*q[3]), 2*(q[2]*q[3] - q[0]*q[1]),
           2*(q[1]*q[3] - q[0]*q[2]), 2*(q[2]*q[3] + q[0]*q[1]), 1 - 2*(q[1]*q[1] + q[2]*q[2])};
-for (int i = 0; i < 3; ++i) s[i] = gather(scales.data, 3, i);
+for (int i = 0; i < 3; ++i) s[i] = gather(gaussians.scales.data, 3, i);
 
 // rows u, v of J W (projection's Jacobian times the camera's rotation), and a = u R S, b = v R S,
 // such that the image covariance is [a.a a.b; a.b b.b]
@@ -92,7 +124,7 @@ F c0 = a[1]*b[2] - a[2]*b[1], c1 = a[2]*b[0] - a[0]*b[2], c2 = a[0]*b[1] - a[1]*
 // det = |a x b|^2 + blur (aa + bb) + blur^2: no cancellation, however thin the splat
 F idet = 1.0f / (c0*c0 + c1*c1 + c2*c2 + BLUR * (aa + bb) + BLUR * BLUR);
 F A = (bb + BLUR) * idet, B = -ab * idet, C = (aa + BLUR) * idet;
-F o = gather(opacities.data, 1, 0);
+F o = gather(gaussians.opacities.data, 1, 0);
 """.replace("BLUR", f"{BLUR}f")
 
 _FORWARD = r"""
@@ -107,16 +139,16 @@ visible &= (px + rx > 0) & (px - rx < cam[19]) & (py + ry > 0) & (py - ry < cam[
 _INVISIBLE = by_device(
     r"""
 if (!visible) {
-    for (int j = 0; j < 16; ++j) splats.data[16 * (long long)row + j] = 0;
-    keys.data[row] = -1;
+    for (int j = 0; j < 16; ++j) projected.splats.data[16 * (long long)row + j] = 0;
+    projected.keys.data[row] = -1;
     return;
 }
 """,
     r"""
 if (!bits(visible)) {
     for (int l = 0; l < count; ++l) {
-        store(splats.data + 16 * (long)row[l], (F)(0.0f));
-        keys.data[row[l]] = -1;
+        store(projected.splats.data + 16 * (long)row[l], (F)(0.0f));
+        projected.keys.data[row[l]] = -1;
     }
     return;
 }
@@ -137,24 +169,24 @@ for (int l = 0; l < count; ++l) {
     F r = none;
     if (key[l] >= 0)
         for (int j = 0; j < 13; ++j) r[j] = f[j][l];
-    store(splats.data + 16 * (long)row[l], r);
-    keys.data[row[l]] = key[l];
-    short* rect = rects.data + 4 * (long)row[l];
+    store(projected.splats.data + 16 * (long)row[l], r);
+    projected.keys.data[row[l]] = key[l];
+    short* rect = projected.rects.data + 4 * (long)row[l];
     rect[0] = x0[l]; rect[1] = y0[l]; rect[2] = x1[l]; rect[3] = y1[l];
 }
 """.replace("BIN_SIZE", str(BIN_SIZE))
 
 _WRITE_ONE = r"""
-float4* to = (float4*)(splats.data + 16 * (long long)row);
+float4* to = (float4*)(projected.splats.data + 16 * (long long)row);
 to[0] = make_float4(px, py, A, B);
 to[1] = make_float4(C, o, fmaxf(rgb[0], 0.0f), fmaxf(rgb[1], 0.0f));
 to[2] = make_float4(fmaxf(rgb[2], 0.0f), z, lo, rx);
 to[3] = make_float4(ry, 0.0f, 0.0f, 0.0f);
-keys.data[row] = __float_as_int(z);
+projected.keys.data[row] = __float_as_int(z);
 auto tile = [](float edge, float size) {
     return (short)fminf(fmaxf(edge * (1.0f / TILE_SIZE), 0.0f), (float)((int)(size - 1) / TILE_SIZE));
 };
-short* rect = rects.data + 4 * (long long)row;
+short* rect = projected.rects.data + 4 * (long long)row;
 rect[0] = tile(px - rx - 0.5f, cam[19]);
 rect[1] = tile(py - ry - 0.5f, cam[20]);
 rect[2] = tile(px + rx - 0.5f, cam[19]);
@@ -167,8 +199,8 @@ _WRITE = by_device(_WRITE_ONE, _WRITE_GROUP)
 _ADJOINT_ROWS = by_device(
     r"""
 const F none = 0;
-const bool drawn = splats.data[16 * (long long)row + 11] > 0;
-auto slot = [&](int j) { return drawn ? gather(grads.data, 16, j) : none; };
+const bool drawn = rows.splats.data[16 * (long long)row + 11] > 0;
+auto slot = [&](int j) { return drawn ? gather(rows.grads.data, 16, j) : none; };
 auto scatter = [&](float* to, int stride, int column, F value) {
     to[(long long)row * stride + column] = drawn ? value : none;
 };
@@ -176,8 +208,8 @@ auto scatter = [&](float* to, int stride, int column, F value) {
     r"""
 const F none = (F)(0.0f);
 I drawn;
-for (int l = 0; l < 16; ++l) drawn[l] = splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
-auto slot = [&](int j) { return drawn ? gather(grads.data, 16, j) : none; };
+for (int l = 0; l < 16; ++l) drawn[l] = rows.splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
+auto slot = [&](int j) { return drawn ? gather(rows.grads.data, 16, j) : none; };
 auto scatter = [&](float* to, int stride, int column, F value) {
     value = drawn ? value : none;
     for (int l = 0; l < count; ++l) to[(long)row[l] * stride + column] = value[l];
@@ -201,7 +233,7 @@ for (int j = 0; j < 3; ++j) {
         vs[j] += vM * R[3*i+j];
         vR[3*i+j] = vM * s[j];
     }
-    scatter(v_scales.data, 3, j, vs[j]);
+    scatter(v_gaussians.scales.data, 3, j, vs[j]);
 }
 F vq[4];
 vq[0] = 2 * (q[1]*(vR[7] - vR[5]) + q[2]*(vR[2] - vR[6]) + q[3]*(vR[3] - vR[1]));
@@ -209,7 +241,7 @@ vq[1] = 2 * (q[2]*(vR[1] + vR[3]) + q[3]*(vR[2] + vR[6]) + q[0]*(vR[7] - vR[5]) 
 vq[2] = 2 * (q[1]*(vR[1] + vR[3]) + q[3]*(vR[5] + vR[7]) + q[0]*(vR[2] - vR[6]) - 2*q[2]*(vR[0] + vR[8]));
 vq[3] = 2 * (q[1]*(vR[2] + vR[6]) + q[2]*(vR[5] + vR[7]) + q[0]*(vR[3] - vR[1]) - 2*q[3]*(vR[0] + vR[4]));
 F along = vq[0]*q[0] + vq[1]*q[1] + vq[2]*q[2] + vq[3]*q[3];  // the quaternion is normalised
-for (int i = 0; i < 4; ++i) scatter(v_quats.data, 4, i, (vq[i] - along * q[i]) * iq);
+for (int i = 0; i < 4; ++i) scatter(v_gaussians.quats.data, 4, i, (vq[i] - along * q[i]) * iq);
 
 // u = fx/z (w0 - xc w2), v = fy/z (w1 - yc w2) with xc = x/z clamped to its limits
 F vxc = none, vyc = none, uu = none, vvv = none;
@@ -224,50 +256,40 @@ F vxz = inx + fx * slot(0), vyz = iny + fy * slot(1);
 F vp[3] = {vxz * iz, vyz * iz, slot(9) - (uu + vvv + vxz * xz + vyz * yz) * iz};
 F vm[3];
 for (int i = 0; i < 3; ++i) vm[i] = cam[i] * vp[0] + cam[3+i] * vp[1] + cam[6+i] * vp[2];
-scatter(v_opacities.data, 1, 0, slot(5));
+scatter(v_gaussians.opacities.data, 1, 0, slot(5));
 """
 
 _DIRECTION = r"""
 F radial = vd[0] * x + vd[1] * y + vd[2] * h;
-for (int i = 0; i < 3; ++i) scatter(v_means.data, 3, i, vm[i] + (vd[i] - radial * d[i]) * id);
+for (int i = 0; i < 3; ++i) scatter(v_gaussians.means.data, 3, i, vm[i] + (vd[i] - radial * d[i]) * id);
 """
 
 
 @wp.func_native(_ROWS + _GEOMETRY + _FORWARD + _INVISIBLE + HARMONICS + _WRITE)
 def _project_group(
-    group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
-    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float],
-    splats: wp.array[float], keys: wp.array[int], rects: wp.array[wp.int16],
+    group: int, camera: wp.array[float], gaussians: GaussianArrays, projected: ProjectedSplats
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _project(
-    start: int, piece: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
-    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float],
-    splats: wp.array[float], keys: wp.array[int], rects: wp.array[wp.int16],
+    start: int, piece: int, camera: wp.array[float], gaussians: GaussianArrays, projected: ProjectedSplats
 ):  # fmt: skip
-    _project_group(start + wp.tid(), n, k, camera, means, quats, scales, opacities, sh, splats, keys, rects)
+    _project_group(start + wp.tid(), camera, gaussians, projected)
 
 
 @wp.func_native(_ROWS + _GEOMETRY + HARMONICS + _ADJOINT_ROWS + _BACKWARD + HARMONICS_ADJOINT + _DIRECTION)
 def _unproject_group(
-    group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
-    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float], splats: wp.array[float],
-    grads: wp.array[float], v_means: wp.array[float], v_quats: wp.array[float], v_scales: wp.array[float],
-    v_opacities: wp.array[float], v_sh: wp.array[float],
+    group: int, camera: wp.array[float], gaussians: GaussianArrays, rows: SplatGradients, v_gaussians: GaussianArrays
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _project_adjoint(
-    start: int, piece: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
-    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float], splats: wp.array[float],
-    grads: wp.array[float], v_means: wp.array[float], v_quats: wp.array[float], v_scales: wp.array[float],
-    v_opacities: wp.array[float], v_sh: wp.array[float],
+    start: int, piece: int, camera: wp.array[float], gaussians: GaussianArrays, rows: SplatGradients,
+    v_gaussians: GaussianArrays,
 ):  # fmt: skip
-    _unproject_group(start + wp.tid(), n, k, camera, means, quats, scales, opacities, sh, splats,
-                     grads, v_means, v_quats, v_scales, v_opacities, v_sh)  # fmt: skip
+    _unproject_group(start + wp.tid(), camera, gaussians, rows, v_gaussians)
 
 
 def pack_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
@@ -284,33 +306,38 @@ def pack_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float
     return torch.tensor(np.asarray(numbers, np.float32))
 
 
-def _launch(kernel: wp.Kernel, n: int, k: int, tensors: tuple[Tensor, ...]) -> None:
-    """Launch a kernel on all n Gaussians of k harmonics coefficients."""
-    flat = [view(t.view(-1)) for t in tensors]
-    if tensors[0].is_cuda:
-        launch(kernel, n, [0, 0, n, k, *flat], device=device_of(tensors[0]))
+def _launch(kernel: wp.Kernel, means: Tensor, inputs: list) -> None:
+    """Launch a kernel on all Gaussians."""
+    if means.is_cuda:
+        launch(kernel, len(means), [0, 0, *inputs], device=device_of(means))
     else:
-        launch_ranges(kernel, even_bounds(-(-n // LANES), num_threads()), [n, k, *flat])
+        launch_ranges(kernel, even_bounds(-(-len(means) // LANES), num_threads()), inputs)
+
+
+def _arrays(gaussians: Sequence[Tensor]) -> GaussianArrays:
+    """The tensors of `GaussianArrays`, in its order, for kernels."""
+    return with_arrays(GaussianArrays(), dict(zip(GaussianArrays.vars, gaussians, strict=True)))
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, means, quats, scales, opacities, sh):
-        n, k = len(means), sh.shape[1]
+    def forward(ctx, camera, *gaussians):
+        means = gaussians[0]
+        n = len(means)
         splats = means.new_empty(n, SPLAT_SIZE)
         keys, rects = means.new_empty(n, dtype=torch.int32), means.new_empty(n, 4, dtype=torch.int16)
-        _launch(_project, n, k, (camera, means, quats, scales, opacities, sh, splats, keys, rects))
-        ctx.save_for_backward(camera, means, quats, scales, opacities, sh, splats)
+        projected = with_arrays(ProjectedSplats(), {"splats": splats, "keys": keys, "rects": rects})
+        _launch(_project, means, [view(camera), _arrays(gaussians), projected])
+        ctx.save_for_backward(camera, *gaussians, splats)
         ctx.mark_non_differentiable(keys, rects)
         return splats, keys, rects
 
     @staticmethod
     def backward(ctx, v_splats, _keys, _rects):
-        camera, means, quats, scales, opacities, sh, splats = ctx.saved_tensors
-        n, k = len(means), sh.shape[1]
-        grads = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
-        tensors = (camera, means, quats, scales, opacities, sh, splats, v_splats.contiguous(), *grads)
-        _launch(_project_adjoint, n, k, tensors)
+        camera, *gaussians, splats = ctx.saved_tensors
+        grads = [torch.empty_like(t) for t in gaussians]
+        rows = with_arrays(SplatGradients(), {"splats": splats, "grads": v_splats})
+        _launch(_project_adjoint, gaussians[0], [view(camera), _arrays(gaussians), rows, _arrays(grads)])
         return None, *grads
 
 

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import view
+from stages.core.kernels.interop import view, with_arrays
 from stages.core.kernels.splat.projection import BIN_SIZE
 from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
@@ -21,6 +21,7 @@ wp.set_module_options({"enable_backward": False})
 # Radix sort, least significant digit first, 3 x 11 bits (the sign of a depth is always 0); stable.
 _SORT = r"""
 enum { DIGITS = 2048 };
+const int n = keys.shape[0];
 unsigned hist[3][DIGITS] = {};
 unsigned* key[2] = {(unsigned*)scratch.data, (unsigned*)scratch.data + n};
 int* id[2] = {order.data, scratch.data + 2 * (long)n};
@@ -46,12 +47,20 @@ for (int pass = 0; pass < 3; ++pass) {
 total.data[0] = m;
 """
 
+# The range of a part, in locals: stores to other arrays must not make the compiler read the struct again.
+_RANGE = r"""
+const int begin = splats.bounds.data[piece], end = splats.bounds.data[piece + 1], across = splats.across;
+const int* ids = splats.ids.data;
+const short* rects = splats.rects.data;
+"""
+
 # Counting pass: each part counts its range of the order, which gives its write position in every bin.
 _COUNT = r"""
+const int bins = counts.shape[1];
 int* count = counts.data + (long)piece * bins;
 for (int b = 0; b < bins; ++b) count[b] = 0;
-for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
-    const short* r = rects.data + 4 * (long)order.data[i];
+for (int i = begin; i < end; ++i) {
+    const short* r = rects + 4 * (long)ids[i];
     for (int y = r[1]; y <= r[3]; ++y)
         for (int x = r[0]; x <= r[2]; ++x) ++count[y * across + x];
 }
@@ -59,10 +68,10 @@ for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
 
 # Filling pass: each part appends its range to the bins.
 _FILL = r"""
-int *at = counts.data + (long)piece * bins, slot = firsts.data[piece];
-for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
-    const int id = order.data[i];
-    const short* r = rects.data + 4 * (long)id;
+int *at = counts.data + (long)piece * counts.shape[1], slot = splats.firsts.data[piece];
+for (int i = begin; i < end; ++i) {
+    const int id = ids[i];
+    const short* r = rects + 4 * (long)id;
     for (int y = r[1]; y <= r[3]; ++y)
         for (int x = r[0]; x <= r[2]; ++x) {
             const int k = at[y * across + x]++;
@@ -73,46 +82,59 @@ for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
 """
 
 
+@wp.struct
+class SplatOrder:
+    """The visible splats by depth, in ranges that are worked on in parallel, and the bins that each overlaps."""
+
+    ids: wp.array[int]  # (n,), indices of splats; those outside the ranges are unused
+    bounds: wp.array[int]  # (pieces + 1,), ranges of this order
+    firsts: wp.array[int]  # (pieces,), slot of the first splat of each range
+    rects: wp.array2d[wp.int16]  # (n, 4), first column and row and last ones of the bins of each splat
+    across: int  # bins in a row
+
+
+@wp.struct
+class BinnedSplats:
+    """Splats and the lists of those in each bin; see `Bins`."""
+
+    splats: wp.array2d[float]  # (n, 16)
+    members: wp.array[int]  # (m,)
+    starts: wp.array[int]  # (bins + 1,)
+    ends: wp.array[int]  # (bins,), one past the last member of each bin that compositing came to
+    slots: wp.array[int]  # (m,)
+
+
 @wp.func_native(_SORT)
-def _sort_keys(n: int, keys: wp.array[int], order: wp.array[int], scratch: wp.array[int], total: wp.array[int]): ...
+def _sort_keys(keys: wp.array[int], order: wp.array[int], scratch: wp.array[int], total: wp.array[int]): ...
 
 
 @wp.kernel
 def _sort(
-    start: int, piece: int, n: int, keys: wp.array[int], order: wp.array[int], scratch: wp.array[int],
-    total: wp.array[int],
+    start: int, piece: int, keys: wp.array[int], order: wp.array[int], scratch: wp.array[int], total: wp.array[int]
 ):  # fmt: skip
-    _sort_keys(n, keys, order, scratch, total)
+    _sort_keys(keys, order, scratch, total)
 
 
-@wp.func_native(_COUNT)
-def _count_piece(
-    piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int, bins: int,
-    counts: wp.array[int],
-): ...  # fmt: skip
+@wp.func_native(_RANGE + _COUNT)
+def _count_piece(piece: int, splats: SplatOrder, counts: wp.array2d[int]): ...
 
 
-@wp.func_native(_FILL)
+@wp.func_native(_RANGE + _FILL)
 def _fill_piece(
-    piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int, bins: int,
-    counts: wp.array[int], firsts: wp.array[int], members: wp.array[int], slots: wp.array[int],
+    piece: int, splats: SplatOrder, counts: wp.array2d[int], members: wp.array[int], slots: wp.array[int]
 ): ...  # fmt: skip
 
 
 @wp.kernel
-def _count(
-    start: int, piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int,
-    bins: int, counts: wp.array[int],
-):  # fmt: skip
-    _count_piece(piece, bounds, order, rects, across, bins, counts)
+def _count(start: int, piece: int, splats: SplatOrder, counts: wp.array2d[int]):
+    _count_piece(piece, splats, counts)
 
 
 @wp.kernel
 def _fill(
-    start: int, piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int,
-    bins: int, counts: wp.array[int], firsts: wp.array[int], members: wp.array[int], slots: wp.array[int],
+    start: int, piece: int, splats: SplatOrder, counts: wp.array2d[int], members: wp.array[int], slots: wp.array[int]
 ):  # fmt: skip
-    _fill_piece(piece, bounds, order, rects, across, bins, counts, firsts, members, slots)
+    _fill_piece(piece, splats, counts, members, slots)
 
 
 @dataclass(frozen=True)
@@ -122,10 +144,7 @@ class Bins:
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
     slots: Tensor  # (m,) int32, position of each member in the list by splat: nearest splat first, its bins row by row
-    order: Tensor  # (n,) int32, the visible splats by depth; the other entries are unused
-    bounds: Tensor  # (pieces + 1,) int32, ranges of this order
-    firsts: Tensor  # (pieces,) int32, slot of the first splat of each range
-    rects: Tensor  # (n, 4) int16, first column and row and last ones of the bins of each splat
+    order: SplatOrder
     width: int  # [px]
     height: int
     side: int = BIN_SIZE
@@ -134,6 +153,11 @@ class Bins:
     def columns(self) -> int:
         """Number of bins in a row."""
         return -(-self.width // self.side)
+
+    def of(self, splats: Tensor, ends: Tensor | None = None) -> BinnedSplats:
+        """These bins of splats (n, 16) for kernels, and where compositing ended in each of them (bins,), if it has."""
+        tensors = {"splats": splats, "members": self.members, "starts": self.starts, "slots": self.slots}
+        return with_arrays(BinnedSplats(), tensors if ends is None else {**tensors, "ends": ends})
 
     def balanced_bounds(self, count: int, work: Tensor | None = None) -> list[int]:
         """Bounds of at most `count` ranges of bins with about equal work (bins,), by default the number of members."""
@@ -159,19 +183,20 @@ def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int =
     order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
     total = torch.zeros(1, dtype=torch.int32)
     if n:
-        launch_ranges(_sort, [0, 1], [n, view(keys), view(order), view(scratch), view(total)])
+        launch_ranges(_sort, [0, 1], [view(keys), view(order), view(scratch), view(total)])
     pieces = num_threads()
     bounds = torch.tensor(even_bounds(int(total), pieces), dtype=torch.int32)
     counts = torch.empty(pieces, bins, dtype=torch.int32)
-    arguments = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
-    launch_ranges(_count, list(range(pieces + 1)), arguments)
-    firsts = (counts.sum(1).cumsum(0) - counts.sum(1)).int()
+    ordered = with_arrays(SplatOrder(), {"ids": order, "bounds": bounds, "rects": rects})
+    ordered.across = across
+    launch_ranges(_count, list(range(pieces + 1)), [ordered, view(counts)])
+    ordered.firsts = view((counts.sum(1).cumsum(0) - counts.sum(1)).int())
     ends = counts.T.reshape(-1).cumsum(0, dtype=torch.int32)  # bin by bin, within it piece by piece
     starts = torch.cat([ends.new_zeros(1), ends[pieces - 1 :: pieces]])
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
     members, slots = torch.empty(2, int(ends[-1]), dtype=torch.int32)
-    launch_ranges(_fill, list(range(pieces + 1)), [*arguments, view(firsts), view(members), view(slots)])
-    return Bins(members, starts, slots, order, bounds, firsts, rects, width, height, side)
+    launch_ranges(_fill, list(range(pieces + 1)), [ordered, view(counts), view(members), view(slots)])
+    return Bins(members, starts, slots, ordered, width, height, side)
 
 
 def depth_order_reference(splats: Tensor) -> Tensor:

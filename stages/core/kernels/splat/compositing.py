@@ -14,7 +14,8 @@ from torch import Tensor
 
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat import compositing_cuda
-from stages.core.kernels.splat.binning import Bins
+from stages.core.kernels.splat.binning import BinnedSplats, Bins
+from stages.core.kernels.splat.canvas import Canvas, canvas_over, image_gradients
 from stages.core.kernels.splat.compositing_adjoint import composite_adjoint
 from stages.core.kernels.splat.pixel_blocks import (
     BIN_BLOCKS,
@@ -41,10 +42,10 @@ for (int b = 0; b < BLOCKS; ++b) {
     if (bits(in)) alive |= 1ull << b;
 }
 int k = begin;
-for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
-    __builtin_prefetch(splats.data + 16 * (long)members.data[k + 8 < end ? k + 8 : k]);
-    const int id = members.data[k];
-    const float* s = splats.data + 16 * (long)id;
+for (; k < end && alive; ++k) {
+    __builtin_prefetch(splats + 16 * (long)members[k + 8 < end ? k + 8 : k]);
+    const int id = members[k];
+    const float* s = splats + 16 * (long)id;
     const float x = s[0] - X, y = s[1] - Y;
     const float A = -0.721347520f * s[2], B = -1.44269504f * s[3], C = -0.721347520f * s[4], lo = s[10];
     TRACK(F sum = none;)
@@ -69,19 +70,21 @@ for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
     }
     TRACK(float total = 0; for (int l = 0; l < 16; ++l) total += sum[l]; totals.data[k] = total;)
 }
-ends.data[bin] = k;
+bins.ends.data[bin] = k;
 for (int b = 0; b < BLOCKS; ++b) {
     F t = __builtin_elementwise_abs(T[b]);
     I in = inside(b);
-    store(left.data + ((long)bin * BLOCKS + b) * 16, t);
-    __builtin_memcpy(stops.data + ((long)bin * BLOCKS + b) * 16, &stop[b], 64);
+    store(canvas.left.data + ((long)bin * BLOCKS + b) * 16, t);
+    __builtin_memcpy(canvas.stops.data + ((long)bin * BLOCKS + b) * 16, &stop[b], 64);
     for (int l = 0; l < 16; ++l) {
         if (!in[l]) continue;
         const int p = pixel(b, l);
         const float alpha = 1 - t[l];
-        for (int c = 0; c < 3; ++c) rgb.data[3 * (long)p + c] = colour[b][c][l] + t[l] * behind.data[step * p + c];
-        fourth.data[p] = mean ? colour[b][3][l] / (alpha > MIN_MEAN_ALPHA ? alpha : MIN_MEAN_ALPHA) : colour[b][3][l];
-        alphas.data[p] = alpha;
+        for (int c = 0; c < 3; ++c)
+            canvas.rgb.data[3 * (long)p + c] = colour[b][c][l] + t[l] * canvas.behind.data[step * p + c];
+        const float sum = colour[b][3][l];
+        canvas.fourth.data[p] = canvas.mean ? sum / (alpha > MIN_MEAN_ALPHA ? alpha : MIN_MEAN_ALPHA) : sum;
+        canvas.alpha.data[p] = alpha;
         TRACK(index.data[p] = which[b][l];)
     }
 }
@@ -101,48 +104,30 @@ def _forward(track: bool) -> wp.Kernel:
 
     @wp.func_native(macro + VECTORS + BIN_BLOCKS + _FORWARD + "\n#undef TRACK\n")
     def composite_bin(
-        bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-        members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
-        stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
-        alphas: wp.array[float], index: wp.array[int], totals: wp.array[float],
+        bin: int, bins: BinnedSplats, canvas: Canvas, index: wp.array2d[int], totals: wp.array[float]
     ): ...  # fmt: skip
 
     @wp.kernel(module="unique", enable_backward=False)
     def composite(
-        start: int, piece: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-        members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
-        stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
-        alphas: wp.array[float], index: wp.array[int], totals: wp.array[float],
+        start: int, piece: int, bins: BinnedSplats, canvas: Canvas, index: wp.array2d[int], totals: wp.array[float]
     ):  # fmt: skip
-        composite_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
-                      left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
+        composite_bin(start + wp.tid(), bins, canvas, index, totals)
 
     return composite
 
 
-def _arguments(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor | None) -> list:
-    """Kernel arguments, from the width on."""
-    flat = (splats, bins.members, bins.starts, behind, *tensors)
-    step = 0 if behind.dim() == 1 else 3
-    views = (None if t is None else view(t.view(-1)) for t in flat)
-    return [bins.width, bins.height, bins.columns, step, int(mean), *views]
-
-
 def _draw(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, index: Tensor | None = None,
-          totals: Tensor | None = None) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
-    """Images (rgb, fourth, alpha) and saved state (transmittance, stops, ends); fills `index` and `totals` if given."""
+          totals: Tensor | None = None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:  # fmt: skip
+    """Images (rgb, fourth, alpha) and saved state (left, stops, ends); fills `index` and `totals` if given."""
     count, size = len(bins.starts) - 1, (bins.height, bins.width)
-    state = [torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32),
-             torch.empty(count, dtype=torch.int32)]  # fmt: skip
-    images = [torch.empty(*size, 3), torch.empty(size), torch.empty(size)]
-    arguments = _arguments(splats, bins, behind, mean, *state, *images, index, totals)
-    launch_ranges(_forward(index is not None), bins.balanced_bounds(4 * num_threads()), arguments)
-    return images, state
-
-
-def _draw_adjoint(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *state: Tensor) -> Tensor:
-    """Gradient (n, 16) of the splats; `state`: as in `compositing_cuda.draw_adjoint`."""
-    return composite_adjoint(splats, bins, state[2], _arguments(splats, bins, behind, mean, *state))
+    left, stops = torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32)
+    ends = torch.empty(count, dtype=torch.int32)
+    rgb, fourth, alpha = torch.empty(*size, 3), torch.empty(size), torch.empty(size)
+    canvas = canvas_over(behind, mean, rgb=rgb, fourth=fourth, alpha=alpha, left=left, stops=stops)
+    tracked = [None if t is None else view(t) for t in (index, totals)]
+    bounds = bins.balanced_bounds(4 * num_threads())
+    launch_ranges(_forward(index is not None), bounds, [bins.of(splats, ends), canvas, *tracked])
+    return (rgb, fourth, alpha), (left, stops, ends)
 
 
 class _Composite(torch.autograd.Function):
@@ -150,16 +135,17 @@ class _Composite(torch.autograd.Function):
     def forward(ctx, splats, bins, behind, mean):
         draw = compositing_cuda.draw if splats.is_cuda else _draw
         (rgb, fourth, alpha), state = draw(splats, bins, behind, mean)[:2]
-        ctx.save_for_backward(splats, behind, *state, fourth, alpha)
+        ctx.save_for_backward(splats, behind, fourth, alpha, *state)
         ctx.bins, ctx.mean = bins, mean
         return rgb, fourth, alpha
 
     @staticmethod
     def backward(ctx, *upstream):
-        splats, behind, *state = ctx.saved_tensors
-        draw_adjoint = compositing_cuda.draw_adjoint if splats.is_cuda else _draw_adjoint
-        upstream = [v.float().contiguous() for v in upstream]
-        return draw_adjoint(splats, ctx.bins, behind, ctx.mean, *state, *upstream), None, None, None
+        splats, behind, fourth, alpha, left, stops, *ends = ctx.saved_tensors
+        adjoint = compositing_cuda.draw_adjoint if splats.is_cuda else composite_adjoint
+        canvas = canvas_over(behind, ctx.mean, fourth=fourth, alpha=alpha, left=left, stops=stops)
+        gradients = image_gradients(*(v.float() for v in upstream))
+        return adjoint(splats, ctx.bins, *ends, canvas, gradients), None, None, None
 
 
 def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, mean: bool = False):

@@ -11,11 +11,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.interop import device_of, launch, view, with_arrays
+from stages.core.kernels.splat.canvas import Canvas, ImageGradients, canvas_over, image_gradients
 from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_MEAN_ALPHA, MIN_TRANSMITTANCE
-from stages.core.kernels.splat.projection import SPLAT_SIZE, TILE_SIZE
+from stages.core.kernels.splat.projection import SPLAT_SIZE, TILE_SIZE, SplatGradients
 from stages.core.kernels.splat.simd import by_device
-from stages.core.kernels.splat.tiles import Tiles
+from stages.core.kernels.splat.tiles import SlotRanges, TiledSplats, Tiles
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,11 +26,13 @@ MOMENTS = 12  # sums over pixels for each slot: see `_BACKWARD`
 # The thread's pixel and the test whether a splat at x, y with the box rx, ry reaches the pixels of its warp.
 _PIXEL = r"""
 const int t = threadIdx.x, warp = t >> 5, lane = t & 31;
+const int width = canvas.alpha.shape[1], height = canvas.alpha.shape[0], across = (width + 15) / 16;
 const int X = (tile % across) * 16 + (warp & 1) * 8, Y = (tile / across) * 16 + (warp >> 1) * 4;
 const int px = X + (lane & 7), py = Y + (lane >> 3), pixel = py * width + px;
 const bool inside = px < width && py < height;
 const float fx = px + 0.5f, fy = py + 0.5f;
-const int begin = starts.data[tile], end = starts.data[tile + 1];
+const int begin = tiles.starts.data[tile], end = tiles.starts.data[tile + 1];
+const int step = canvas.behind.shape[0] == 3 ? 0 : 3;
 auto reaches = [X, Y](float4 box) {
     return box.x + box.z >= X + 0.5f && box.x - box.z <= X + 7.5f && box.y + box.w >= Y + 0.5f
         && box.y - box.w <= Y + 3.5f;
@@ -40,7 +43,7 @@ auto reaches = [X, Y](float4 box) {
 _LOAD = r"""
 __shared__ float4 box[BATCH], form[BATCH], colour[BATCH];
 auto load = [&](int at, int k) {
-    const float4* s = (const float4*)(splats.data + 16 * (long long)ids.data[slots.data[k]]);
+    const float4* s = (const float4*)(tiles.splats.data + 16 * (long long)tiles.ids.data[tiles.slots.data[k]]);
     const float4 a = s[0], b = s[1], c = s[2];
     box[at] = make_float4(a.x, a.y, c.w, s[3].x);
     form[at] = make_float4(-0.721347520f * a.z, -1.44269504f * a.w, -0.721347520f * b.x, c.z);
@@ -81,15 +84,15 @@ for (int base = begin; base < end; base += 256) {
 }
 if (inside) {
     const float alpha = 1 - T;
-    const float* behind_pixel = behind.data + step * (long long)pixel;
-    rgb.data[3 * pixel] = r + T * behind_pixel[0];
-    rgb.data[3 * pixel + 1] = g + T * behind_pixel[1];
-    rgb.data[3 * pixel + 2] = b + T * behind_pixel[2];
-    fourth.data[pixel] = mean ? z / fmaxf(alpha, MIN_MEAN_ALPHA) : z;
-    alphas.data[pixel] = alpha;
-    left.data[pixel] = T;
-    stops.data[pixel] = stop;
-    dominant.data[pixel] = which < 0 ? -1 : ids.data[slots.data[which]];
+    const float* behind_pixel = canvas.behind.data + step * (long long)pixel;
+    canvas.rgb.data[3 * pixel] = r + T * behind_pixel[0];
+    canvas.rgb.data[3 * pixel + 1] = g + T * behind_pixel[1];
+    canvas.rgb.data[3 * pixel + 2] = b + T * behind_pixel[2];
+    canvas.fourth.data[pixel] = canvas.mean ? z / fmaxf(alpha, MIN_MEAN_ALPHA) : z;
+    canvas.alpha.data[pixel] = alpha;
+    canvas.left.data[pixel] = T;
+    canvas.stops.data[pixel] = stop;
+    dominant.data[pixel] = which < 0 ? -1 : tiles.ids.data[tiles.slots.data[which]];
 }
 """
 
@@ -107,18 +110,18 @@ __shared__ float part[32][8][12];
 float T = 1, S = 0, v[4] = {0, 0, 0, 0};
 int stop = begin;
 if (inside) {
-    T = left.data[pixel];
-    stop = stops.data[pixel];
-    const float* behind_pixel = behind.data + step * (long long)pixel;
-    float v_alpha = v_alphas.data[pixel];
+    T = canvas.left.data[pixel];
+    stop = canvas.stops.data[pixel];
+    const float* behind_pixel = canvas.behind.data + step * (long long)pixel;
+    float v_alpha = upstream.alpha.data[pixel];
     for (int c = 0; c < 3; ++c) {
-        v[c] = v_rgb.data[3 * pixel + c];
+        v[c] = upstream.rgb.data[3 * pixel + c];
         v_alpha -= v[c] * behind_pixel[c];
     }
-    v[3] = v_fourth.data[pixel];
-    if (mean) {
-        v[3] = alphas.data[pixel] > MIN_MEAN_ALPHA ? v[3] / alphas.data[pixel] : 0;
-        v_alpha -= v[3] * fourth.data[pixel];
+    v[3] = upstream.fourth.data[pixel];
+    if (canvas.mean) {
+        v[3] = canvas.alpha.data[pixel] > MIN_MEAN_ALPHA ? v[3] / canvas.alpha.data[pixel] : 0;
+        v_alpha -= v[3] * canvas.fourth.data[pixel];
     }
     S = -v_alpha * T;
 }
@@ -127,15 +130,15 @@ __syncthreads();
 atomicMax(&last, stop);
 __syncthreads();
 for (int i = t; i < 12 * (end - last); i += 256)  // members that no pixel reached
-    moments.data[12 * slots.data[last + i / 12] + i % 12] = 0;
+    moments.data[12 * tiles.slots.data[last + i / 12] + i % 12] = 0;
 for (int top = last; top > begin; top -= 32) {
     const int count = top - begin < 32 ? top - begin : 32;  // members top - 1, top - 2, ...
     __syncthreads();
     if (t < count) {
         const int k = top - 1 - t;
         load(t, k);
-        slot[t] = (int)slots.data[k];
-        const float* s = splats.data + 16 * (long long)ids.data[slot[t]];
+        slot[t] = (int)tiles.slots.data[k];
+        const float* s = tiles.splats.data + 16 * (long long)tiles.ids.data[slot[t]];
         conic[t] = make_float4(s[2], s[3], s[4], 0);
     }
     for (int i = t; i < count * 96; i += 256) ((float*)part)[i] = 0;
@@ -181,19 +184,20 @@ for (int top = last; top > begin; top -= 32) {
 
 # Sum of a splat's slots, 16 threads a splat, and conversion to the gradient of its row.
 _GRADIENT = r"""
-const int r = at / 16, c = at % 16, id = (int)order.data[r];
-int slot = ends.data[r] - counts.data[r], to = ends.data[r] < capacity ? ends.data[r] : capacity;
+const int r = at / 16, c = at % 16, id = (int)order.ids.data[r];
+const int end = order.ends.data[r], to = end < moments.shape[0] ? end : moments.shape[0];
+int slot = end - order.counts.data[r];
 float m = 0;
 if (c < 12)
     for (; slot < to; ++slot) m += moments.data[12 * (long long)slot + c];
 const float x = __shfl_sync(0xffffffff, m, 0, 16), y = __shfl_sync(0xffffffff, m, 1, 16);
-const float* s = splats.data + 16 * (long long)id;
+const float* s = rows.splats.data + 16 * (long long)id;
 if (c == 0) m = s[2] * x + s[3] * y;
 if (c == 1) m = s[3] * x + s[4] * y;
 if (c == 2 || c == 4) m *= -0.5f;
 if (c == 3) m = -m;
 if (c == 5) m = s[5] > 0 ? m / s[5] : 0;
-grads.data[16 * (long long)id + c] = m;
+rows.grads.data[16 * (long long)id + c] = m;
 """
 
 
@@ -206,88 +210,59 @@ def _on_cuda(code: str, batch: int = 0) -> str:
 
 
 @wp.func_native(_on_cuda(_PIXEL + _LOAD + _FORWARD, batch=256))
-def _draw_pixel(
-    tile: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
-    alphas: wp.array[float], dominant: wp.array[int],
-): ...  # fmt: skip
+def _draw_pixel(tile: int, tiles: TiledSplats, canvas: Canvas, dominant: wp.array2d[int]): ...
 
 
 @wp.kernel
-def _composite(
-    width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
-    alphas: wp.array[float], dominant: wp.array[int],
-):  # fmt: skip
-    _draw_pixel(wp.tid() // wp.static(THREADS), width, height, across, step, mean, splats, slots, ids, starts, behind,
-                left, stops, rgb, fourth, alphas, dominant)  # fmt: skip
+def _composite(tiles: TiledSplats, canvas: Canvas, dominant: wp.array2d[int]):
+    _draw_pixel(wp.tid() // wp.static(THREADS), tiles, canvas, dominant)
 
 
 @wp.func_native(_on_cuda(_PIXEL + _LOAD + _BACKWARD, batch=32))
 def _adjoint_of_pixel(
-    tile: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
-    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+    tile: int, tiles: TiledSplats, canvas: Canvas, upstream: ImageGradients, moments: wp.array2d[float]
 ): ...  # fmt: skip
 
 
 @wp.kernel
-def _composite_adjoint(
-    width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
-    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
-    left: wp.array[float], stops: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
-    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
-):  # fmt: skip
-    _adjoint_of_pixel(wp.tid() // wp.static(THREADS), width, height, across, step, mean, splats, slots, ids, starts,
-                      behind, left, stops, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
+def _composite_adjoint(tiles: TiledSplats, canvas: Canvas, upstream: ImageGradients, moments: wp.array2d[float]):
+    _adjoint_of_pixel(wp.tid() // wp.static(THREADS), tiles, canvas, upstream, moments)
 
 
 @wp.func_native(_on_cuda(_GRADIENT))
-def _gradient_value(
-    at: int, capacity: int, order: wp.array[wp.int64], counts: wp.array[int], ends: wp.array[int],
-    splats: wp.array[float], moments: wp.array[float], grads: wp.array[float],
-): ...  # fmt: skip
+def _gradient_value(at: int, order: SlotRanges, moments: wp.array2d[float], rows: SplatGradients): ...
 
 
 @wp.kernel
-def _gradients(
-    capacity: int, order: wp.array[wp.int64], counts: wp.array[int], ends: wp.array[int], splats: wp.array[float],
-    moments: wp.array[float], grads: wp.array[float],
-):  # fmt: skip
-    _gradient_value(wp.tid(), capacity, order, counts, ends, splats, moments, grads)
+def _gradients(order: SlotRanges, moments: wp.array2d[float], rows: SplatGradients):
+    _gradient_value(wp.tid(), order, moments, rows)
 
 
-def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *tensors: Tensor) -> None:
+def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, inputs: list) -> None:
     """Launch a kernel with a block of threads for each tile."""
-    step = 0 if behind.dim() == 1 else 3
-    flat = [view(t.view(-1)) for t in (splats, tiles.slots, tiles.ids, tiles.starts, behind, *tensors)]
-    sizes = [tiles.width, tiles.height, tiles.columns, step, int(mean)]
-    launch(kernel, THREADS * (len(tiles.starts) - 1), [*sizes, *flat], device=device_of(splats), block_dim=THREADS)
+    count = THREADS * (len(tiles.starts) - 1)
+    launch(kernel, count, [tiles.of(splats), *inputs], device=device_of(splats), block_dim=THREADS)
 
 
 def draw(
     splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, Tensor], Tensor]:
-    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)); the transmittance (h, w) left and the end of the list
-    (h, w) of each pixel; and the splat with the largest weight in it (h, w; -1: none)."""
+    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)); the transmittance (h * w,) left and the end of the list
+    (h * w,) of each pixel; and the splat with the largest weight in it (h, w; -1: none)."""
     new, size = splats.new_empty, (tiles.height, tiles.width)
-    left, stops, rgb = new(size), new(size, dtype=torch.int32), new(*size, 3)
-    fourth, alpha, dominant = new(size), new(size), new(size, dtype=torch.int32)
-    _launch(_composite, splats, tiles, behind, mean, left, stops, rgb, fourth, alpha, dominant)
+    rgb, fourth, alpha, dominant = new(*size, 3), new(size), new(size), new(size, dtype=torch.int32)
+    left, stops = new(alpha.numel()), new(alpha.numel(), dtype=torch.int32)
+    canvas = canvas_over(behind, mean, rgb=rgb, fourth=fourth, alpha=alpha, left=left, stops=stops)
+    _launch(_composite, splats, tiles, [canvas, view(dominant)])
     return (rgb, fourth, alpha), (left, stops), dominant
 
 
-def draw_adjoint(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *state: Tensor) -> Tensor:
-    """Gradient (n, 16) of the splats. `state`: transmittance, list ends, fourth channel and alpha as `draw` returns
-    them, then the gradients of rgb, fourth channel and alpha."""
-    n, capacity = len(splats), len(tiles.slots)
-    moments, grads = splats.new_empty(capacity, MOMENTS), torch.empty_like(splats)
-    _launch(_composite_adjoint, splats, tiles, behind, mean, *state, moments)
-    flat = [view(t.view(-1)) for t in (tiles.order, tiles.counts, tiles.ends, splats, moments, grads)]
-    launch(_gradients, n * SPLAT_SIZE, [capacity, *flat], device=device_of(splats))
+def draw_adjoint(splats: Tensor, tiles: Tiles, canvas: Canvas, upstream: ImageGradients) -> Tensor:
+    """Gradient (n, 16) of the splats. `canvas`: as `draw` left it."""
+    moments, grads = splats.new_empty(len(tiles.slots), MOMENTS), torch.empty_like(splats)
+    _launch(_composite_adjoint, splats, tiles, [canvas, upstream, view(moments)])
+    rows = with_arrays(SplatGradients(), {"splats": splats, "grads": grads})
+    launch(_gradients, len(splats) * SPLAT_SIZE, [tiles.order, view(moments), rows], device=device_of(splats))
     return grads
 
 
@@ -297,9 +272,10 @@ def composite_with_dominant(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tenso
     A splat's total weight is the derivative of the sum over all pixels of a colour channel by the splat's colour.
     """
     behind = splats.new_zeros(3)
-    (rgb, fourth, alpha), state, dominant = draw(splats, tiles, behind, True)
+    (rgb, fourth, alpha), (left, stops), dominant = draw(splats, tiles, behind, True)
+    canvas = canvas_over(behind, True, fourth=fourth, alpha=alpha, left=left, stops=stops)
     v_rgb = torch.zeros_like(rgb)
     v_rgb[..., 0] = 1
     none = torch.zeros_like(alpha)
-    grads = draw_adjoint(splats, tiles, behind, True, *state, fourth, alpha, v_rgb, none, none)
+    grads = draw_adjoint(splats, tiles, canvas, image_gradients(v_rgb, none, none))
     return rgb, fourth, alpha, dominant.long(), grads[:, 6].contiguous()

@@ -23,9 +23,9 @@ if (k > 9) {
 }
 F rgb[3] = {(F)(0.5f), (F)(0.5f), (F)(0.5f)};
 for (int i = 0; i < k; ++i)
-    for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(gaussians.sh.data, 3 * k, 3 * i + c);
+    for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(sh, 3 * k, 3 * i + c);
 """
-"""In: means m, camera centre cam[16..18], k coefficients. Out: unit direction d, basis Y, colour rgb (not clamped)."""
+"""In: means m, camera centre cam[16..18], k coefficients sh. Out: unit direction d, basis Y, rgb (not clamped)."""
 
 HARMONICS_ADJOINT = r"""
 F vrgb[3], vY[16];
@@ -33,8 +33,8 @@ for (int c = 0; c < 3; ++c) vrgb[c] = rgb[c] >= 0 ? slot(6 + c) : none;
 for (int i = 0; i < k; ++i) {
     vY[i] = none;
     for (int c = 0; c < 3; ++c) {
-        vY[i] += vrgb[c] * gather(gaussians.sh.data, 3 * k, 3 * i + c);
-        scatter(v_gaussians.sh.data, 3 * k, 3 * i + c, Y[i] * vrgb[c]);
+        vY[i] += vrgb[c] * gather(sh, 3 * k, 3 * i + c);
+        scatter(v_sh, 3 * k, 3 * i + c, Y[i] * vrgb[c]);
     }
 }
 F vd[3] = {none, none, none};
@@ -54,4 +54,4 @@ if (k > 9) {
            + 0.5f * k32 * (xx - yy) * vY[14];
 }
 """
-"""In: gradient of the colour, slots 6 to 8. Out: gradient of the coefficients, stored, and of the direction, vd."""
+"""In: gradient of the colour, slots 6 to 8. Out: gradient of the coefficients, v_sh, and of the direction, vd."""

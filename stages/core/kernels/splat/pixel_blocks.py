@@ -14,11 +14,14 @@ PIXELS_PER_BIN = BLOCKS_PER_BIN * 16  # per-pixel state is stored by block, then
 
 BIN_BLOCKS = r"""
 enum { BLOCKS = 64 };
+const int width = canvas.alpha.shape[1], height = canvas.alpha.shape[0], across = (width + 31) / 32;
 const int X = (bin % across) * 32, Y = (bin / across) * 32;
 const F lx = {.5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f};
 const F ly = {.5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f, 2.5f, 2.5f, 2.5f, 2.5f, 3.5f, 3.5f, 3.5f, 3.5f};
 const F none = (F)(0.0f);
-const int begin = starts.data[bin];
+const float* splats = bins.splats.data;
+const int *members = bins.members.data, begin = bins.starts.data[bin], end = bins.starts.data[bin + 1];
+const int step = canvas.behind.shape[0] == 3 ? 0 : 3;
 auto inside = [&](int block) -> I {
     return (lx + (float)(X + 4 * (block & 7)) < (float)width) & (ly + (float)(Y + 4 * (block >> 3)) < (float)height);
 };
@@ -37,7 +40,7 @@ auto overlapped = [&](float x, float y, float rx, float ry) -> unsigned long lon
     return columns & (~0ull << (8 * i0)) & (~0ull >> (56 - 8 * i1));
 };
 """
-"""C++: pixel coordinates of the lanes of each block, and the blocks that a splat overlaps.
+"""C++: the list of a bin, pixel coordinates of the lanes of each block, and the blocks that a splat overlaps.
 
-Uses the variables bin, across (bins per row), width, height and starts of the kernel.
+Uses the number `bin`, the `bins` (BinnedSplats) and the `canvas` of the kernel.
 """

@@ -69,12 +69,12 @@ class SplatGradients:
 _ROWS = by_device(
     SCALARS
     + r"""
-const int row = group, k = gaussians.sh.shape[1];
+const int row = group;
 auto gather = [row](const float* p, int stride, int column) { return p[(long long)row * stride + column]; };
 """,
     VECTORS
     + r"""
-const int n = gaussians.means.shape[0], k = gaussians.sh.shape[1];
+const int n = gaussians.means.shape[0];
 const int count = n - 16 * group < 16 ? n - 16 * group : 16;
 int row[16];
 for (int l = 0; l < 16; ++l) row[l] = 16 * group + (l < count ? l : 0);
@@ -88,9 +88,12 @@ auto gather = [&row](const float* p, int stride, int column) {
 
 # Out: covariance on the image and its inverse.
 _GEOMETRY = r"""
+const float *means = gaussians.means.data, *quats = gaussians.quats.data, *scales = gaussians.scales.data;
+const float *opacities = gaussians.opacities.data, *sh = gaussians.sh.data;
+const int k = gaussians.sh.shape[1];
 const float* cam = camera.data;
 F m[3], p[3], q[4], s[3];
-for (int i = 0; i < 3; ++i) m[i] = gather(gaussians.means.data, 3, i);
+for (int i = 0; i < 3; ++i) m[i] = gather(means, 3, i);
 for (int i = 0; i < 3; ++i) p[i] = cam[3*i] * m[0] + cam[3*i+1] * m[1] + cam[3*i+2] * m[2] + cam[9+i];
 I visible = (p[2] >= cam[21]) & (p[2] < 1e10f);
 const float fx = cam[12], fy = cam[13];
@@ -99,13 +102,13 @@ F xz = p[0] * iz, yz = p[1] * iz;
 // far outside the image the Jacobian is evaluated at the limit, where the linearisation is still bounded
 F xc = vmin(vmax(xz, (F)(cam[22])), (F)(cam[23])), yc = vmin(vmax(yz, (F)(cam[24])), (F)(cam[25]));
 
-for (int i = 0; i < 4; ++i) q[i] = gather(gaussians.quats.data, 4, i);
+for (int i = 0; i < 4; ++i) q[i] = gather(quats, 4, i);
 F iq = 1.0f / vsqrt(q[0]*q[0] + q[1]*q[1] + q[2]*q[2] + q[3]*q[3]);
 for (int i = 0; i < 4; ++i) q[i] *= iq;
 F R[9] = {1 - 2*(q[2]*q[2] + q[3]*q[3]), 2*(q[1]*q[2] - q[0]*q[3]), 2*(q[1]*q[3] + q[0]*q[2]),
           2*(q[1]*q[2] + q[0]*q[3]), 1 - 2*(q[1]*q[1] + q[3]*q[3]), 2*(q[2]*q[3] - q[0]*q[1]),
           2*(q[1]*q[3] - q[0]*q[2]), 2*(q[2]*q[3] + q[0]*q[1]), 1 - 2*(q[1]*q[1] + q[2]*q[2])};
-for (int i = 0; i < 3; ++i) s[i] = gather(gaussians.scales.data, 3, i);
+for (int i = 0; i < 3; ++i) s[i] = gather(scales, 3, i);
 
 // rows u, v of J W (projection's Jacobian times the camera's rotation), and a = u R S, b = v R S,
 // such that the image covariance is [a.a a.b; a.b b.b]
@@ -124,7 +127,7 @@ F c0 = a[1]*b[2] - a[2]*b[1], c1 = a[2]*b[0] - a[0]*b[2], c2 = a[0]*b[1] - a[1]*
 // det = |a x b|^2 + blur (aa + bb) + blur^2: no cancellation, however thin the splat
 F idet = 1.0f / (c0*c0 + c1*c1 + c2*c2 + BLUR * (aa + bb) + BLUR * BLUR);
 F A = (bb + BLUR) * idet, B = -ab * idet, C = (aa + BLUR) * idet;
-F o = gather(gaussians.opacities.data, 1, 0);
+F o = gather(opacities, 1, 0);
 """.replace("BLUR", f"{BLUR}f")
 
 _FORWARD = r"""
@@ -218,6 +221,8 @@ auto scatter = [&](float* to, int stride, int column, F value) {
 )
 
 _BACKWARD = r"""
+float *v_means = v_gaussians.means.data, *v_quats = v_gaussians.quats.data, *v_scales = v_gaussians.scales.data;
+float *v_opacities = v_gaussians.opacities.data, *v_sh = v_gaussians.sh.data;
 // gradient by the covariance from that by its inverse C: G = -C V C with V symmetric
 F va = slot(2), vb = 0.5f * slot(3), vc = slot(4);
 F t00 = A*va + B*vb, t01 = A*vb + B*vc, t10 = B*va + C*vb, t11 = B*vb + C*vc;
@@ -233,7 +238,7 @@ for (int j = 0; j < 3; ++j) {
         vs[j] += vM * R[3*i+j];
         vR[3*i+j] = vM * s[j];
     }
-    scatter(v_gaussians.scales.data, 3, j, vs[j]);
+    scatter(v_scales, 3, j, vs[j]);
 }
 F vq[4];
 vq[0] = 2 * (q[1]*(vR[7] - vR[5]) + q[2]*(vR[2] - vR[6]) + q[3]*(vR[3] - vR[1]));
@@ -241,7 +246,7 @@ vq[1] = 2 * (q[2]*(vR[1] + vR[3]) + q[3]*(vR[2] + vR[6]) + q[0]*(vR[7] - vR[5]) 
 vq[2] = 2 * (q[1]*(vR[1] + vR[3]) + q[3]*(vR[5] + vR[7]) + q[0]*(vR[2] - vR[6]) - 2*q[2]*(vR[0] + vR[8]));
 vq[3] = 2 * (q[1]*(vR[2] + vR[6]) + q[2]*(vR[5] + vR[7]) + q[0]*(vR[3] - vR[1]) - 2*q[3]*(vR[0] + vR[4]));
 F along = vq[0]*q[0] + vq[1]*q[1] + vq[2]*q[2] + vq[3]*q[3];  // the quaternion is normalised
-for (int i = 0; i < 4; ++i) scatter(v_gaussians.quats.data, 4, i, (vq[i] - along * q[i]) * iq);
+for (int i = 0; i < 4; ++i) scatter(v_quats, 4, i, (vq[i] - along * q[i]) * iq);
 
 // u = fx/z (w0 - xc w2), v = fy/z (w1 - yc w2) with xc = x/z clamped to its limits
 F vxc = none, vyc = none, uu = none, vvv = none;
@@ -256,12 +261,12 @@ F vxz = inx + fx * slot(0), vyz = iny + fy * slot(1);
 F vp[3] = {vxz * iz, vyz * iz, slot(9) - (uu + vvv + vxz * xz + vyz * yz) * iz};
 F vm[3];
 for (int i = 0; i < 3; ++i) vm[i] = cam[i] * vp[0] + cam[3+i] * vp[1] + cam[6+i] * vp[2];
-scatter(v_gaussians.opacities.data, 1, 0, slot(5));
+scatter(v_opacities, 1, 0, slot(5));
 """
 
 _DIRECTION = r"""
 F radial = vd[0] * x + vd[1] * y + vd[2] * h;
-for (int i = 0; i < 3; ++i) scatter(v_gaussians.means.data, 3, i, vm[i] + (vd[i] - radial * d[i]) * id);
+for (int i = 0; i < 3; ++i) scatter(v_means, 3, i, vm[i] + (vd[i] - radial * d[i]) * id);
 """
 
 

@@ -15,12 +15,31 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.interop import device_of, launch, view, with_arrays
 from stages.core.kernels.splat.projection import TILE_SIZE
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_INT16 = 2**15 - 1
+
+
+@wp.struct
+class SlotRanges:
+    """The splats by depth and the slots of each: ends[r] - counts[r] up to ends[r]."""
+
+    ids: wp.array[wp.int64]  # (n,)
+    counts: wp.array[int]  # (n,)
+    ends: wp.array[int]  # (n,); may exceed the number of slots if the capacity was too small
+
+
+@wp.struct
+class TiledSplats:
+    """Splats and the lists of those in each tile; see `Tiles`."""
+
+    splats: wp.array2d[float]  # (n, 16)
+    slots: wp.array[wp.int64]  # (m,)
+    ids: wp.array[int]  # (m,)
+    starts: wp.array[int]  # (tiles + 1,)
 
 
 @wp.kernel
@@ -35,14 +54,13 @@ def _count(order: wp.array[wp.int64], keys: wp.array[int], rects: wp.array2d[wp.
 
 @wp.kernel
 def _fill(
-    order: wp.array[wp.int64], rects: wp.array2d[wp.int16], counts: wp.array[int], ends: wp.array[int], across: int,
-    tiles: wp.array[wp.int32], ids: wp.array[int],
+    splats: SlotRanges, rects: wp.array2d[wp.int16], across: int, tiles: wp.array[wp.int32], ids: wp.array[int]
 ):  # fmt: skip
     r = wp.tid()
-    i = wp.int32(order[r])
-    if counts[r] == 0:
+    i = wp.int32(splats.ids[r])
+    if splats.counts[r] == 0:
         return
-    slot = ends[r] - counts[r]
+    slot = splats.ends[r] - splats.counts[r]
     for y in range(int(rects[i, 1]), int(rects[i, 3]) + 1):
         for x in range(int(rects[i, 0]), int(rects[i, 2]) + 1):
             if slot < tiles.shape[0]:
@@ -86,9 +104,7 @@ class Tiles:
     slots: Tensor  # (m,) int64: tile b holds slots[starts[b]:starts[b + 1]]
     ids: Tensor  # (m,) int32, splat of each slot
     starts: Tensor  # (tiles + 1,) int32
-    order: Tensor  # (n,) int64, splats by depth
-    counts: Tensor  # (n,) int32, number of slots of the splats in this order
-    ends: Tensor  # (n,) int32, one past the last slot of each; may exceed m if the capacity was too small
+    order: SlotRanges
     width: int  # [px]
     height: int
 
@@ -96,6 +112,12 @@ class Tiles:
     def columns(self) -> int:
         """Number of tiles in a row."""
         return -(-self.width // TILE_SIZE)
+
+    def of(self, splats: Tensor) -> TiledSplats:
+        """These tiles of splats (n, 16) for kernels."""
+        tiled = with_arrays(TiledSplats(), {"splats": splats, "ids": self.ids, "starts": self.starts})
+        tiled.slots = view(self.slots)
+        return tiled
 
 
 def bin_tiles(keys: Tensor, rects: Tensor, width: int, height: int, capacity: Capacity | None = None) -> Tiles:
@@ -116,11 +138,12 @@ def bin_tiles(keys: Tensor, rects: Tensor, width: int, height: int, capacity: Ca
         torch.maximum(capacity.needed, ends[-1:], out=capacity.needed)
     tiles = torch.full((size,), -1, dtype=torch.int32, device=device)
     ids = torch.zeros(size, dtype=torch.int32, device=device)
-    launch(_fill, n, [view(order), view(rects), view(counts), view(ends), across], [view(tiles), view(ids)],
-           device_of(keys))  # fmt: skip
+    ranges = with_arrays(SlotRanges(), {"counts": counts, "ends": ends})
+    ranges.ids = view(order)
+    launch(_fill, n, [ranges, view(rects), across], [view(tiles), view(ids)], device_of(keys))
     # a narrow key takes fewer passes of the radix sort
     narrow = tiles.to(torch.int16) if across * down <= MAX_INT16 else tiles
     tiles, slots = narrow.sort(stable=True)
     starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
     launch(_starts, size, [view(tiles.int())], [view(starts)], device_of(keys))
-    return Tiles(slots, ids, starts, order, counts, ends, width, height)
+    return Tiles(slots, ids, starts, ranges, width, height)

@@ -18,14 +18,16 @@ from torch import Tensor
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat import ssim_pixel
 from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
-from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS
+from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS, ImagePair, image_pair
 
 wp.set_module_options({"enable_backward": False})
 
 # Window down the columns at every element of row i, then along the row; COUNT maps at once.
 _ROWS = r"""
 const float window[11] = {WINDOW};
-const int size = width * channels, line = size + 10 * channels + 16;
+const float *first = images.first.data, *second = images.second.data;
+const int height = images.first.shape[0], channels = images.channels, width = images.first.shape[1] / channels;
+const int size = width * channels, line = size + 10 * channels + 16;  // as a multiple of channels: faster code
 float* scratch = lines.data + (long)piece * COUNT * line;
 const int top = i < 5 ? 5 - i : 0, bottom = i + 5 < height ? 10 : height - 1 - i + 5;
 auto some = [&](const float* p, int count) {
@@ -60,7 +62,7 @@ for (int j = 0; j < size; j += 16) {
     for (int m = 0; m < 5; ++m) sum[m] = (F)(0.0f);
     for (int t = top; t <= bottom; ++t) {
         const long at = (long)(i + t - 5) * size + j;
-        F x = some(first.data + at, size - j), y = some(second.data + at, size - j);
+        F x = some(first + at, size - j), y = some(second + at, size - j);
         F wx = window[t] * x, wy = window[t] * y;
         sum[0] += wx; sum[1] += wy; sum[2] += wx * x; sum[3] += wy * y; sum[4] += wx * y;
     }
@@ -102,7 +104,7 @@ for (int j = 0; j < size; j += 16) {
     F e[3];
     along(e, j);
     const long at = (long)i * size + j;
-    F x = some(first.data + at, size - j), y = some(second.data + at, size - j);
+    F x = some(first + at, size - j), y = some(second + at, size - j);
     put(grads.data + at, e[0] + 2 * x * e[1] + y * e[2], size - j);
 }
 """
@@ -110,32 +112,31 @@ for (int j = 0; j < size; j += 16) {
 
 @wp.func_native(VECTORS + _ROWS.replace("COUNT", "5") + _FORWARD)
 def _ssim_row(
-    i: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], derivatives: wp.array[float], totals: wp.array[wp.float64],
+    i: int, piece: int, images: ImagePair, lines: wp.array[float], derivatives: wp.array[float],
+    totals: wp.array[wp.float64],
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _similarity(
-    start: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], derivatives: wp.array[float], totals: wp.array[wp.float64],
+    start: int, piece: int, images: ImagePair, lines: wp.array[float], derivatives: wp.array[float],
+    totals: wp.array[wp.float64],
 ):  # fmt: skip
-    _ssim_row(start + wp.tid(), piece, height, width, channels, first, second, lines, derivatives, totals)
+    _ssim_row(start + wp.tid(), piece, images, lines, derivatives, totals)
 
 
 @wp.func_native(VECTORS + _ROWS.replace("COUNT", "3") + _BACKWARD)
 def _gradient_row(
-    i: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], derivatives: wp.array[float], grads: wp.array[float],
+    i: int, piece: int, images: ImagePair, lines: wp.array[float], derivatives: wp.array[float], grads: wp.array[float]
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _gradient(
-    start: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], derivatives: wp.array[float], grads: wp.array[float],
+    start: int, piece: int, images: ImagePair, lines: wp.array[float], derivatives: wp.array[float],
+    grads: wp.array[float],
 ):  # fmt: skip
-    _gradient_row(start + wp.tid(), piece, height, width, channels, first, second, lines, derivatives, grads)
+    _gradient_row(start + wp.tid(), piece, images, lines, derivatives, grads)
 
 
 def _forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,8 +158,8 @@ def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *output
     height, width, channels = first.shape
     pieces = num_threads()
     lines = torch.empty(pieces * maps * (width * channels + 2 * WINDOW_RADIUS * channels + LANES))
-    flat = [view(t.view(-1)) for t in (first, second, lines, *outputs)]
-    launch_ranges(kernel, even_bounds(height, pieces), [height, width, channels, *flat])
+    flat = [view(t.view(-1)) for t in (lines, *outputs)]
+    launch_ranges(kernel, even_bounds(height, pieces), [image_pair(first, second), *flat])
 
 
 def _passes(image: Tensor):

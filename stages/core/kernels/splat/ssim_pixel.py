@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.interop import device_of, launch, view, with_arrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,16 +28,32 @@ maps5 = wp.types.vector(5, wp.float32)
 taps = wp.types.vector(TAPS, wp.float32)
 
 
+@wp.struct
+class ImagePair:
+    """Two images of the same size that are compared, the channels of a pixel side by side."""
+
+    first: wp.array2d[float]  # (h, w * c)
+    second: wp.array2d[float]  # (h, w * c)
+    channels: int
+
+
+def image_pair(first: Tensor, second: Tensor) -> ImagePair:
+    """Images (h, w, c) for kernels."""
+    images = with_arrays(ImagePair(), {"first": first.flatten(1), "second": second.flatten(1)})
+    images.channels = first.shape[2]
+    return images
+
+
 @wp.kernel
-def _down(window: taps, first: wp.array2d[float], second: wp.array2d[float], sums: wp.array2d[maps5]):
+def _down(window: taps, images: ImagePair, sums: wp.array2d[maps5]):
     """Window down the columns of both images, their squares and their product."""
     i, j = wp.tid()
     total = maps5()
     for t in range(wp.static(TAPS)):
         row = i + t - wp.static(WINDOW_RADIUS)
-        if row >= 0 and row < first.shape[0]:
-            x = first[row, j]
-            y = second[row, j]
+        if row >= 0 and row < images.first.shape[0]:
+            x = images.first[row, j]
+            y = images.second[row, j]
             total += window[t] * maps5(x, y, x * x, y * y, x * y)
     sums[i, j] = total
 
@@ -78,25 +94,24 @@ def _down_derivatives(window: taps, derivatives: wp.array2d[wp.vec3], sums: wp.a
 
 @wp.kernel
 def _gather(
-    window: taps, channels: int, factor: float, first: wp.array2d[float], second: wp.array2d[float],
-    sums: wp.array2d[wp.vec3], grads: wp.array2d[float],
+    window: taps, factor: float, images: ImagePair, sums: wp.array2d[wp.vec3], grads: wp.array2d[float]
 ):  # fmt: skip
     """Window along the rows; chain rule to the first image: d mean = window, d variance = 2 x, d covariance = y."""
     i, j = wp.tid()
     e = wp.vec3()
     for t in range(wp.static(TAPS)):
-        column = j + (t - wp.static(WINDOW_RADIUS)) * channels
+        column = j + (t - wp.static(WINDOW_RADIUS)) * images.channels
         if column >= 0 and column < sums.shape[1]:
             e += window[t] * sums[i, column]
-    grads[i, j] = factor * (e[0] + 2.0 * first[i, j] * e[1] + second[i, j] * e[2])
+    grads[i, j] = factor * (e[0] + 2.0 * images.first[i, j] * e[1] + images.second[i, j] * e[2])
 
 
 def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """SSIM map (h, w * c) of images (h, w, c), and its derivatives (h, w * c, 3) by the first image's mean and variance
     and by the covariance."""
-    x, y = first.flatten(1), second.flatten(1)
+    x = first.flatten(1)
     sums, ssim_map, derivatives = x.new_empty(*x.shape, 5), torch.empty_like(x), x.new_empty(*x.shape, 3)
-    launch(_down, x.shape, [taps(WINDOW), view(x), view(y)], [view(sums, maps5)], device_of(x))
+    launch(_down, x.shape, [taps(WINDOW), image_pair(first, second)], [view(sums, maps5)], device_of(x))
     launch(_compare, x.shape, [taps(WINDOW), first.shape[2], view(sums, maps5)],
            [view(ssim_map), view(derivatives, wp.vec3)], device_of(x))  # fmt: skip
     return ssim_map, derivatives
@@ -104,10 +119,10 @@ def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 def ssim_backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:
     """Gradient (h, w, c) of the mean SSIM by the first image; `derivatives` as `ssim_forward` returns them."""
-    x, y = first.flatten(1), second.flatten(1)
+    x = first.flatten(1)
     sums, grads = torch.empty_like(derivatives), torch.empty_like(x)
     launch(_down_derivatives, x.shape, [taps(WINDOW), view(derivatives, wp.vec3)], [view(sums, wp.vec3)], device_of(x))
     launch(_gather, x.shape,
-           [taps(WINDOW), first.shape[2], 1 / x.numel(), view(x), view(y), view(sums, wp.vec3)],
-           [view(grads)], device_of(x))  # fmt: skip
+           [taps(WINDOW), 1 / x.numel(), image_pair(first, second), view(sums, wp.vec3)], [view(grads)],
+           device_of(x))  # fmt: skip
     return grads.view(first.shape)

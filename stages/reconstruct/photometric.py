@@ -22,7 +22,7 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.adam import Moments, adam_step
 from stages.core.kernels.cuda_graphs import captured
-from stages.core.kernels.splat.photometric_loss import LossTerms, photometric_loss
+from stages.core.kernels.splat.photometric_loss import LossTerms, PhotoTarget, photometric_loss
 from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.kernels.splat.tiles import Capacity
@@ -289,7 +289,7 @@ def _loss(
     rgb, alpha, depth, *_ = rasterise_packed(gaussians, camera, *group.size, grey.expand(3), pairs)
     inverse = None if group.inverse is None else group.inverse.index_select(0, row)[0]
     terms = LossTerms(SSIM_WEIGHT, DEPTH_WEIGHT, fit.camera_distance, MIN_DEPTH * fit.camera_distance)
-    loss = photometric_loss(rgb, alpha, depth, gain, photo, inverse, terms)
+    loss = photometric_loss(rgb, alpha, depth, gain, PhotoTarget(photo, inverse), terms)
     return loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.camera_distance
 
 

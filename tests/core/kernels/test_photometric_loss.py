@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stages.core.kernels.splat.photometric_loss import LossTerms, _Loss, photometric_loss_reference
+from stages.core.kernels.splat.photometric_loss import LossTerms, PhotoTarget, _Loss, photometric_loss_reference
 
 TERMS = LossTerms(0.2, 0.1, 2.5, 0.25)
 HEIGHT, WIDTH = 37, 50
@@ -24,10 +24,11 @@ def inputs(device: str) -> tuple:
 @pytest.mark.parametrize("with_depth", [True, False])
 def test_value_and_gradients_equal_the_reference(device, with_depth):
     rgb, alpha, depth, gain, photo, inverse = inputs(device)
+    target = PhotoTarget(photo, inverse if with_depth else None)
     results = []
     for loss in (_Loss.apply, photometric_loss_reference):
         leaves = [t.clone().requires_grad_() for t in (rgb, depth, gain)]
-        value = loss(leaves[0], alpha, leaves[1], leaves[2], photo, inverse if with_depth else None, TERMS)
+        value = loss(leaves[0], alpha, leaves[1], leaves[2], target, TERMS)
         (3 * value).backward()
         results.append((value.detach(), *(t.grad if t.grad is not None else torch.zeros_like(t) for t in leaves)))
     fused, reference = results

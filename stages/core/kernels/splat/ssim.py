@@ -27,7 +27,7 @@ _ROWS = r"""
 const float window[11] = {WINDOW};
 const float *first = images.first.data, *second = images.second.data;
 const int height = images.first.shape[0], channels = images.channels, width = images.first.shape[1] / channels;
-const int size = width * channels, line = size + 10 * channels + 16;  // as a multiple of channels: faster code
+const int size = width * channels, line = size + 10 * channels + 16;  // size as a product: faster code
 float* scratch = lines.data + (long)piece * COUNT * line;
 const int top = i < 5 ? 5 - i : 0, bottom = i + 5 < height ? 10 : height - 1 - i + 5;
 auto some = [&](const float* p, int count) {

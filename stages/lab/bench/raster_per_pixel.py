@@ -10,8 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import view
-from stages.core.kernels.splat.binning import Bins, bin_splats
+from stages.core.kernels.interop import view, with_arrays
+from stages.core.kernels.splat.binning import BinnedSplats, Bins, bin_splats
 from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_TRANSMITTANCE
 from stages.core.kernels.splat.projection import MIN_ALPHA
 from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
@@ -21,24 +21,37 @@ TILE = 16  # [px]
 GRADIENT_CHANNELS = 10  # channels of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
 
 
+@wp.struct
+class FinishedPixels:
+    """Where the forward pass finished each pixel."""
+
+    left: wp.array2d[float]  # (h, w), transmittance
+    ends: wp.array2d[int]  # (h, w), one past the last splat in the list of the pixel's tile
+
+
 @wp.func
 def _falloff(splats: wp.array2d[float], s: int, dx: float, dy: float):
     return wp.exp(-0.5 * (splats[s, 2] * dx * dx + splats[s, 4] * dy * dy) - splats[s, 3] * dx * dy)
 
 
+@wp.func
+def _tile(i: int, j: int, width: int) -> int:
+    across = (width + wp.static(TILE) - 1) // wp.static(TILE)
+    return (i // wp.static(TILE)) * across + j // wp.static(TILE)
+
+
 @wp.kernel
-def _forward(
-    start: int, piece: int, width: int, across: int, splats: wp.array2d[float], members: wp.array[int],
-    starts: wp.array[int], image: wp.array[wp.vec4], left: wp.array[float], ends: wp.array[int],
-):  # fmt: skip
+def _forward(start: int, piece: int, bins: BinnedSplats, image: wp.array2d[wp.vec4], pixels: FinishedPixels):
     p = start + wp.tid()
+    width = image.shape[1]
     i, j = p // width, p % width
-    bin = (i // wp.static(TILE)) * across + j // wp.static(TILE)
+    bin = _tile(i, j, width)
     T = wp.float32(1.0)
     colour = wp.vec4()
-    k = wp.int32(starts[bin])
-    while k < starts[bin + 1]:
-        s = members[k]
+    splats = bins.splats
+    k = wp.int32(bins.starts[bin])
+    while k < bins.starts[bin + 1]:
+        s = bins.members[k]
         alpha = wp.min(splats[s, 5] * _falloff(splats, s, float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]),
                        wp.static(MAX_ALPHA))  # fmt: skip
         if alpha >= wp.static(MIN_ALPHA):
@@ -47,27 +60,28 @@ def _forward(
             colour += alpha * T * wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9])
             T *= 1.0 - alpha
         k += 1
-    image[p] = colour
-    left[p] = T
-    ends[p] = k
+    image[i, j] = colour
+    pixels.left[i, j] = T
+    pixels.ends[i, j] = k
 
 
 @wp.kernel
 def _backward(
-    start: int, piece: int, width: int, across: int, splats: wp.array2d[float], members: wp.array[int],
-    starts: wp.array[int], v_image: wp.array[wp.vec4], left: wp.array[float], ends: wp.array[int],
+    start: int, piece: int, bins: BinnedSplats, v_image: wp.array2d[wp.vec4], pixels: FinishedPixels,
     grads: wp.array3d[float],
 ):  # fmt: skip
     p = start + wp.tid()
+    width = v_image.shape[1]
     i, j = p // width, p % width
-    bin = (i // wp.static(TILE)) * across + j // wp.static(TILE)
-    T = wp.float32(left[p])
-    v = v_image[p]
+    bin = _tile(i, j, width)
+    T = wp.float32(pixels.left[i, j])
+    v = v_image[i, j]
+    splats = bins.splats
     behind = wp.float32(0.0)  # upstream gradient times the colour composited behind
-    k = wp.int32(ends[p])
-    while k > starts[bin]:
+    k = wp.int32(pixels.ends[i, j])
+    while k > bins.starts[bin]:
         k -= 1
-        s = members[k]
+        s = bins.members[k]
         dx, dy = float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]
         fall = _falloff(splats, s, dx, dy)
         alpha = wp.min(splats[s, 5] * fall, wp.static(MAX_ALPHA))
@@ -92,26 +106,28 @@ def _backward(
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, splats, bins):
-        count = bins.width * bins.height
-        image, left, ends = torch.empty(count, 4), torch.empty(count), torch.empty(count, dtype=torch.int32)
-        _launch(_forward, splats, bins, view(image, wp.vec4), view(left), view(ends))
+        size = (bins.height, bins.width)
+        image, left, ends = torch.empty(*size, 4), torch.empty(size), torch.empty(size, dtype=torch.int32)
+        _launch(_forward, splats, bins, [view(image, wp.vec4), _finished(left, ends)])
         ctx.save_for_backward(splats, left, ends)
         ctx.bins = bins
-        return image.view(bins.height, bins.width, 4)
+        return image
 
     @staticmethod
     def backward(ctx, v_image):
         splats, left, ends = ctx.saved_tensors
         grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table per thread
-        v_image = v_image.reshape(-1, 4).contiguous()
-        _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
+        _launch(_backward, splats, ctx.bins, [view(v_image.contiguous(), wp.vec4), _finished(left, ends), view(grads)])
         return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - GRADIENT_CHANNELS)), None
 
 
-def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
+def _finished(left: Tensor, ends: Tensor) -> FinishedPixels:
+    return with_arrays(FinishedPixels(), {"left": left, "ends": ends})
+
+
+def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, inputs: list) -> None:
     """Launch over the image's pixels in as many pieces as there are threads."""
-    inputs = [bins.width, bins.columns, view(splats), view(bins.members), view(bins.starts), *views]
-    launch_ranges(kernel, even_bounds(bins.width * bins.height, num_threads()), inputs)
+    launch_ranges(kernel, even_bounds(bins.width * bins.height, num_threads()), [bins.of(splats), *inputs])
 
 
 def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:

@@ -193,9 +193,10 @@ def test_tiles_hold_overlapping_splats_nearest_first(n):
     order = depth_order_reference(splats.cpu())
     members = tiles.ids[tiles.slots].cpu().long()
     low, high = (splats[:, :2] - splats[:, 11:13]).cpu()[order], (splats[:, :2] + splats[:, 11:13]).cpu()[order]
-    assert len(tiles.starts) == tiles.columns * -(-HEIGHT // TILE_SIZE) + 1 and int(tiles.starts[-1]) == len(members)
+    across = -(-WIDTH // TILE_SIZE)
+    assert len(tiles.starts) == across * -(-HEIGHT // TILE_SIZE) + 1 and int(tiles.starts[-1]) == len(members)
     for b in range(len(tiles.starts) - 1):
-        corner = torch.tensor([b % tiles.columns, b // tiles.columns]) * TILE_SIZE
+        corner = torch.tensor([b % across, b // across]) * TILE_SIZE
         touches = ((low <= corner + TILE_SIZE - 0.5) & (high >= corner + 0.5)).all(1)
         listed = members[tiles.starts[b] : tiles.starts[b + 1]]
         assert set(order[touches].tolist()) <= set(listed.tolist())

@@ -139,7 +139,7 @@ def _fill(
 
 @dataclass(frozen=True)
 class Bins:
-    """The splats of each bin of side x side pixels, nearest first; bins are numbered row by row."""
+    """The splats of each bin, nearest first; bins are numbered row by row."""
 
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
@@ -147,12 +147,6 @@ class Bins:
     order: SplatOrder
     width: int  # [px]
     height: int
-    side: int = BIN_SIZE
-
-    @property
-    def columns(self) -> int:
-        """Number of bins in a row."""
-        return -(-self.width // self.side)
 
     def of(self, splats: Tensor, ends: Tensor | None = None) -> BinnedSplats:
         """These bins of splats (n, 16) for kernels, and where compositing ended in each of them (bins,), if it has."""
@@ -196,7 +190,7 @@ def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int =
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
     members, slots = torch.empty(2, int(ends[-1]), dtype=torch.int32)
     launch_ranges(_fill, list(range(pieces + 1)), [ordered, view(counts), view(members), view(slots)])
-    return Bins(members, starts, slots, ordered, width, height, side)
+    return Bins(members, starts, slots, ordered, width, height)
 
 
 def depth_order_reference(splats: Tensor) -> Tensor:

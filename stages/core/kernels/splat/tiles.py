@@ -108,11 +108,6 @@ class Tiles:
     width: int  # [px]
     height: int
 
-    @property
-    def columns(self) -> int:
-        """Number of tiles in a row."""
-        return -(-self.width // TILE_SIZE)
-
     def of(self, splats: Tensor) -> TiledSplats:
         """These tiles of splats (n, 16) for kernels."""
         tiled = with_arrays(TiledSplats(), {"splats": splats, "ids": self.ids, "starts": self.starts})

@@ -21,7 +21,6 @@ from scipy import ndimage
 from stages.core.geometry import surface_faces
 from stages.core.kernels.interop import compiles_for_cpu
 
-_F, _I = wp.float64, wp.int64
 FACES = wp.constant(surface_faces.FACES)
 OPPOSED, CURVED = wp.constant(wp.float64(surface_faces.OPPOSED)), wp.constant(wp.float64(surface_faces.CURVED))
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
@@ -45,6 +44,62 @@ class Inside(NamedTuple):
     normal: np.ndarray  # (k, 3), out of b
     depth: np.ndarray  # (k,)
     facing: np.ndarray  # (k,), cosine of the angle at which the surfaces face each other
+
+
+@wp.struct
+class DepthGrid:
+    """Where the grid of a body is, in its frame, and its nodes among those of all grids."""
+
+    first: wp.int64  # row of the first node
+    shape: wp.vec3l  # nodes along x, y, z
+    low: wp.vec3d  # the first node
+    h: wp.float64  # between nodes
+
+
+@wp.struct
+class DepthNodes:
+    """Values at the nodes of the grids, one after the other."""
+
+    depth: wp.array[wp.float64]
+    smooth: wp.array[wp.float64]  # depth for directions
+    nearest: wp.array[wp.int64]  # sample; -1 for none
+
+
+@wp.struct
+class SurfaceSample:
+    """One of Samples; its fields are described there."""
+
+    point: wp.vec3d
+    normal: wp.vec3d
+    flatness: wp.float64
+    faces: wp.mat33d
+
+
+@wp.struct
+class RigidPose:
+    """Where a body is."""
+
+    turn: wp.mat33d  # from its frame
+    at: wp.vec3d
+
+
+@wp.struct
+class DepthQuery:
+    """Bodies a and b, and the sample of a that is looked up in b."""
+
+    a: wp.int64
+    b: wp.int64
+    sample: wp.int64
+
+
+@wp.struct
+class InsideSample:
+    """What was found for a query, as in Inside; where the depth is 0 the rest is undefined."""
+
+    depth: wp.float64
+    x: wp.vec3d
+    normal: wp.vec3d
+    facing: wp.float64
 
 
 def depth_lookup(depth: Sequence[np.ndarray], low: np.ndarray, h: np.ndarray, samples: Samples) -> DepthLookup:
@@ -133,37 +188,41 @@ class DepthLookup:
 
 
 class CompiledDepthLookup(DepthLookup):
-    """The same by kernels, whose launches are recorded once for arrays that are reused: preparing one takes longer."""
+    """The same by kernels, whose launches are recorded once for arrays that are reused: preparing one takes longer.
+
+    What belongs together is one array of structs: on the CPU, Warp indexes arrays within a struct more slowly.
+    """
 
     def __init__(self, depth: Sequence[np.ndarray], low: np.ndarray, h: np.ndarray, samples: Samples):
         super().__init__(depth, low, h, samples)
-        grids = [self.depth, self.smooth, self.first, self.shape, self.low, self.h]
-        self._grids = [_array(x, t) for x, t in zip(grids, (_F, _F, _I, wp.vec3l, wp.vec3d, _F), strict=True)]
-        types = wp.vec3d, wp.vec3d, _F, wp.mat33d, _I
-        self._samples = [_array(x, t) for x, t in zip(self.samples, types, strict=True)]
-        self._turn, self._at = np.empty((len(h), 3, 3)), np.empty((len(h), 3))
+        self._grids = _records(DepthGrid, len(h), first=self.first, shape=self.shape, low=low, h=h)
+        s = self.samples
+        self._samples = _records(SurfaceSample, len(s.points), point=s.points, normal=s.normals, flatness=s.flatness,
+                                 faces=s.faces)  # fmt: skip
+        self._nodes = DepthNodes()
+        self._nodes.depth, self._nodes.smooth = _array(self.depth, wp.float64), _array(self.smooth, wp.float64)
+        self._nodes.nearest = _array(s.nearest, wp.int64)
+        self._poses = _records(RigidPose, len(h))
         self._reserve(1024)
 
     def _reserve(self, count: int) -> None:
         """Make room for `count` points."""
         self._room = count
-        self._points, self._x, self._normal = (np.empty((count, 3)) for _ in range(3))
-        self._sample, self._a, self._b = (np.empty(count, np.int64) for _ in range(3))
-        self._out, self._facing_out = np.empty(count), np.empty(count)
-        rest = [_array(self._a, _I), _array(self._b, _I), _array(self._turn, wp.mat33d), _array(self._at, wp.vec3d),
-                _array(self._out, _F)]  # fmt: skip
-        found = [_array(self._x, wp.vec3d), _array(self._normal, wp.vec3d), _array(self._facing_out, _F)]
-        points, sample = _array(self._points, wp.vec3d), _array(self._sample, _I)
-        self._distance = wp.launch(_distance, count, [*self._grids, points, *rest], device="cpu", record_cmd=True)
-        inputs = [*self._grids, *self._samples, sample, *rest, *found]
+        self._points, self._out = np.empty((count, 3)), np.empty(count)
+        self._queries, self._found = _records(DepthQuery, count), _records(InsideSample, count)
+        grids, samples = _array(self._grids, DepthGrid), _array(self._samples, SurfaceSample)
+        bodies = _array(self._poses, RigidPose), _array(self._queries, DepthQuery)
+        inputs = [self._nodes.depth, grids, *bodies, _array(self._points, wp.vec3d), _array(self._out, wp.float64)]
+        self._distance = wp.launch(_distance, count, inputs, device="cpu", record_cmd=True)
+        inputs = [self._nodes, grids, samples, *bodies, _array(self._found, InsideSample)]
         self._inside = wp.launch(_inside, count, inputs, device="cpu", record_cmd=True)
 
     def _put(self, a, b, turn, at) -> int:
         count = len(a)
         if count > self._room:
             self._reserve(2 * count)
-        self._a[:count], self._b[:count] = a, b
-        self._turn[:], self._at[:] = turn, at
+        self._queries["a"][:count], self._queries["b"][:count] = a, b
+        self._poses["turn"], self._poses["at"] = turn, at
         return count
 
     def distances(
@@ -178,15 +237,24 @@ class CompiledDepthLookup(DepthLookup):
     def inside(self, sample: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray) -> Inside:
         """As that of DepthLookup."""
         count = self._put(a, b, turn, at)
-        self._sample[:count] = sample
+        self._queries["sample"][:count] = sample
         _run(self._inside, count)
-        k = np.flatnonzero(self._out[:count] > 0)
-        return Inside(k, self._x[k], self._normal[k], self._out[k], self._facing_out[k])
+        k = np.flatnonzero(self._found["depth"][:count] > 0)
+        found = self._found[k]
+        return Inside(k, *(np.ascontiguousarray(found[name]) for name in Inside._fields[1:]))
 
 
 def _array(values: np.ndarray, dtype) -> wp.array:
     """A view of contiguous values, as one of `dtype` for each row."""
     return wp.array(ptr=values.ctypes.data, dtype=dtype, shape=(len(values),), device="cpu")
+
+
+def _records(struct, count: int, **fields: np.ndarray) -> np.ndarray:
+    """`count` instances of a Warp struct with these fields, the others undefined."""
+    out = np.empty(count, struct.numpy_dtype())
+    for name, values in fields.items():
+        out[name] = values
+    return out
 
 
 def _run(recorded: wp.Launch, count: int) -> None:
@@ -196,15 +264,15 @@ def _run(recorded: wp.Launch, count: int) -> None:
 
 
 @wp.func
-def _place(first: wp.int64, shape: wp.vec3l, low: wp.vec3d, h: wp.float64, x: wp.vec3d):
+def _place(g: DepthGrid, x: wp.vec3d):
     """Row of the first node of the cell around a point, and the place of the point in it."""
-    u = (x - low) / h
+    u = (x - g.low) / g.h
     zero, two = wp.int64(0), wp.int64(2)
-    i = wp.clamp(wp.int64(u[0]), zero, shape[0] - two)
-    j = wp.clamp(wp.int64(u[1]), zero, shape[1] - two)
-    k = wp.clamp(wp.int64(u[2]), zero, shape[2] - two)
+    i = wp.clamp(wp.int64(u[0]), zero, g.shape[0] - two)
+    j = wp.clamp(wp.int64(u[1]), zero, g.shape[1] - two)
+    k = wp.clamp(wp.int64(u[2]), zero, g.shape[2] - two)
     f = u - wp.vec3d(wp.float64(i), wp.float64(j), wp.float64(k))
-    return wp.int32(first + (i * shape[1] + j) * shape[2] + k), f
+    return wp.int32(g.first + (i * g.shape[1] + j) * g.shape[2] + k), f
 
 
 @wp.func
@@ -233,18 +301,17 @@ def _gradient(value: wp.array[wp.float64], node: int, shape: wp.vec3l, f: wp.vec
 
 @wp.kernel(enable_backward=False)
 def _distance(
-    depth: wp.array[wp.float64], smooth: wp.array[wp.float64], first: wp.array[wp.int64], shape: wp.array[wp.vec3l],
-    low: wp.array[wp.vec3d], h: wp.array[wp.float64], points: wp.array[wp.vec3d], a: wp.array[wp.int64],
-    b: wp.array[wp.int64], turn: wp.array[wp.mat33d], at: wp.array[wp.vec3d], out: wp.array[wp.float64],
+    depth: wp.array[wp.float64], grids: wp.array[DepthGrid], poses: wp.array[RigidPose], queries: wp.array[DepthQuery],
+    points: wp.array[wp.vec3d], out: wp.array[wp.float64],
 ):  # fmt: skip
     i = wp.tid()
-    own, other = wp.int32(a[i]), wp.int32(b[i])
-    x = wp.transpose(turn[other]) * (turn[own] * points[i] + at[own] - at[other])
-    n = shape[other]
-    one = wp.int64(1)
-    high = low[other] + h[other] * wp.vec3d(wp.float64(n[0] - one), wp.float64(n[1] - one), wp.float64(n[2] - one))
-    inside = wp.min(wp.max(x, low[other]), high)
-    node, f = _place(first[other], n, low[other], h[other], inside)
+    own, other = poses[queries[i].a], poses[queries[i].b]
+    x = wp.transpose(other.turn) * (own.turn * points[i] + own.at - other.at)
+    grid = grids[queries[i].b]
+    n, one = grid.shape, wp.int64(1)
+    high = grid.low + grid.h * wp.vec3d(wp.float64(n[0] - one), wp.float64(n[1] - one), wp.float64(n[2] - one))
+    inside = wp.min(wp.max(x, grid.low), high)
+    node, f = _place(grid, inside)
     distance = -_interpolated(depth, node, n, f)
     beyond = wp.length_sq(x - inside)
     if beyond > wp.float64(0.0):
@@ -255,55 +322,52 @@ def _distance(
 
 @wp.kernel(enable_backward=False)
 def _inside(
-    depth: wp.array[wp.float64], smooth: wp.array[wp.float64], first: wp.array[wp.int64], shape: wp.array[wp.vec3l],
-    low: wp.array[wp.vec3d], h: wp.array[wp.float64], points: wp.array[wp.vec3d], normals: wp.array[wp.vec3d],
-    flatness: wp.array[wp.float64], faces: wp.array[wp.mat33d], nearest: wp.array[wp.int64],
-    sample: wp.array[wp.int64], a: wp.array[wp.int64], b: wp.array[wp.int64], turn: wp.array[wp.mat33d],
-    at: wp.array[wp.vec3d], out: wp.array[wp.float64], out_x: wp.array[wp.vec3d], out_normal: wp.array[wp.vec3d],
-    out_facing: wp.array[wp.float64],
+    nodes: DepthNodes, grids: wp.array[DepthGrid], samples: wp.array[SurfaceSample], poses: wp.array[RigidPose],
+    queries: wp.array[DepthQuery], found: wp.array[InsideSample],
 ):  # fmt: skip
     i = wp.tid()
-    own, other, s = wp.int32(a[i]), wp.int32(b[i]), wp.int32(sample[i])
+    own, other, s = poses[queries[i].a], poses[queries[i].b], samples[queries[i].sample]
     zero, half, one = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
-    x = turn[own] * points[s] + at[own]
-    n = shape[other]
-    node, f = _place(first[other], n, low[other], h[other], wp.transpose(turn[other]) * (x - at[other]))
-    out[i] = zero
+    x = own.turn * s.point + own.at
+    grid = grids[queries[i].b]
+    n = grid.shape
+    node, f = _place(grid, wp.transpose(other.turn) * (x - other.at))
+    found[i].depth = zero
     if wp.min(f) < zero or wp.max(f) > one:
         return
-    inside = _interpolated(depth, node, n, f)
+    inside = _interpolated(nodes.depth, node, n, f)
     if inside <= zero:
         return
-    out[i] = inside
-    out_x[i] = x
+    found[i].depth = inside
+    found[i].x = x
     right, up = wp.where(f[0] > half, n[1], wp.int64(0)), wp.where(f[1] > half, wp.int64(1), wp.int64(0))
     corner = wp.int64(node) + (right + up) * n[2] + wp.where(f[2] > half, wp.int64(1), wp.int64(0))
-    r = wp.int32(nearest[corner])
+    r = nodes.nearest[corner]
     most, opposite = wp.float64(-2.0), wp.vec3d()
-    if r >= 0:
-        to_other = wp.transpose(turn[other]) * turn[own]
+    if r >= wp.int64(0):
+        to_other = wp.transpose(other.turn) * own.turn
         for k in range(FACES):
-            mine = faces[s][k]
+            mine = s.faces[k]
             if wp.length_sq(mine) > zero:
                 mine = to_other * mine
                 for m in range(FACES):
-                    face = faces[r][m]
+                    face = samples[r].faces[m]
                     cosine = -wp.dot(mine, face)
                     if cosine > most and wp.length_sq(face) > zero:
                         most = cosine
                         opposite = face
-    normal = turn[own] * normals[s]
-    direction = -_gradient(smooth, node, n, f)
-    outwards = turn[other] * (direction / wp.max(wp.length(direction), wp.float64(1.0e-12)))
-    out_facing[i] = most
+    normal = own.turn * s.normal
+    direction = -_gradient(nodes.smooth, node, n, f)
+    outwards = other.turn * (direction / wp.max(wp.length(direction), wp.float64(1.0e-12)))
+    found[i].facing = most
     if most < -one:
-        out_facing[i] = -wp.dot(normal, outwards)
-    if most > OPPOSED and (flatness[s] == zero or flatness[r] > flatness[s] + CURVED):
-        out_normal[i] = turn[other] * opposite
-    elif flatness[s] > zero:
-        out_normal[i] = -normal
+        found[i].facing = -wp.dot(normal, outwards)
+    if most > OPPOSED and (s.flatness == zero or samples[r].flatness > s.flatness + CURVED):
+        found[i].normal = other.turn * opposite
+    elif s.flatness > zero:
+        found[i].normal = -normal
     else:
-        out_normal[i] = outwards
+        found[i].normal = outwards
 
 
 def turned(R: np.ndarray, x: np.ndarray) -> np.ndarray:

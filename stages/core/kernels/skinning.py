@@ -7,13 +7,52 @@ Gaussians whose G is exactly zero keep their quats and scales bit for bit.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
+from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix, nearest_rotation, quaternion
-from stages.core.kernels.interop import device_of, kernel_device, launch, view
+from stages.core.kernels.interop import device_of, kernel_device, launch, view, with_arrays
 from stages.core.kernels.threads import run_parallel
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.trajectory import Binding
+
+
+class KeypointMotion(NamedTuple):
+    """Keypoints at rest, and how they and what is around them moved."""
+
+    rest: Float[Tensor, "p 3"]  # [m]
+    displacement: Float[Tensor, "p 3"]  # [m]
+    gradient: Float[Tensor, "p 3 3"]  # of the displacement
+
+
+@wp.struct
+class BindingArrays:
+    """Binding for kernels."""
+
+    index: wp.array2d[wp.int32]
+    weight: wp.array2d[float]
+
+
+@wp.struct
+class KeypointMotionArrays:
+    """KeypointMotion for kernels."""
+
+    rest: wp.array[wp.vec3]
+    displacement: wp.array[wp.vec3]
+    gradient: wp.array[wp.mat33]
+
+
+@wp.struct
+class Ellipsoids:
+    """What skinning changes of Gaussians, for kernels."""
+
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
 
 
 @wp.func
@@ -75,37 +114,35 @@ def _axes(M: wp.mat33) -> wp.mat33:
 
 @wp.kernel
 def _skin(
-    start: int, index: wp.array2d[wp.int32], weight: wp.array2d[float],
-    rest: wp.array[wp.vec3], displacement: wp.array[wp.vec3], gradient: wp.array[wp.mat33],
-    means: wp.array[wp.vec3], quats: wp.array[wp.vec4], scales: wp.array[wp.vec3],
-    new_means: wp.array[wp.vec3], new_quats: wp.array[wp.vec4], new_scales: wp.array[wp.vec3],
+    start: int, binding: BindingArrays, keypoints: KeypointMotionArrays, given: Ellipsoids, moved: Ellipsoids,
     rotation: wp.array[wp.mat33],
 ):  # fmt: skip
     i = start + wp.tid()
-    X = means[i]
+    X = given.means[i]
     shift = wp.vec3()
     G = wp.mat33()
-    for j in range(index.shape[1]):
-        k = index[i, j]
+    for j in range(binding.index.shape[1]):
+        k = binding.index[i, j]
         if k >= 0:
-            shift += weight[i, j] * (displacement[k] + gradient[k] * (X - rest[k]))
-            G += weight[i, j] * gradient[k]
-    new_means[i] = X + shift
-    new_quats[i] = quats[i]
-    new_scales[i] = scales[i]
+            weight = binding.weight[i, j]
+            shift += weight * (keypoints.displacement[k] + keypoints.gradient[k] * (X - keypoints.rest[k]))
+            G += weight * keypoints.gradient[k]
+    moved.means[i] = X + shift
+    moved.quats[i] = given.quats[i]
+    moved.scales[i] = given.scales[i]
     one = wp.identity(n=3, dtype=float)
     rotation[i] = one
     if wp.ddot(G, G) == 0.0:
         return
     F = one + G
-    q = wp.normalize(quats[i])
+    q = wp.normalize(given.quats[i])
     axes = wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0]))
-    M = _axes(F * axes * wp.diag(scales[i]))
-    thin = 1.0e-6 * wp.max(scales[i])
+    M = _axes(F * axes * wp.diag(given.scales[i]))
+    thin = 1.0e-6 * wp.max(given.scales[i])
     x = wp.vec3(M[0, 0], M[1, 0], M[2, 0])
     y = wp.vec3(M[0, 1], M[1, 1], M[2, 1])
     z = wp.vec3(M[0, 2], M[1, 2], M[2, 2])
-    new_scales[i] = wp.vec3(wp.max(wp.length(x), thin), wp.max(wp.length(y), thin), wp.max(wp.length(z), thin))
+    moved.scales[i] = wp.vec3(wp.max(wp.length(x), thin), wp.max(wp.length(y), thin), wp.max(wp.length(z), thin))
     # a right-handed frame, also where an axis vanished
     if wp.length(x) <= thin:
         x = wp.cross(y, z)
@@ -114,55 +151,49 @@ def _skin(
     x = wp.normalize(x)
     y = wp.normalize(y - wp.dot(x, y) * x)
     rotated = wp.quat_from_matrix(wp.matrix_from_cols(x, y, wp.cross(x, y)))
-    new_quats[i] = wp.normalize(wp.vec4(rotated[3], rotated[0], rotated[1], rotated[2]))
+    moved.quats[i] = wp.normalize(wp.vec4(rotated[3], rotated[0], rotated[1], rotated[2]))
     rotation[i] = _rotation_of(F)
 
 
 def skin_gaussians(
-    index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
-    means: Tensor, quats: Tensor, scales: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Deformed means (n, 3) [m], quats (n, 4), scales (n, 3) [m] and rotations (n, 3, 3) of Gaussians.
-
-    index (n, j): keypoints of each Gaussian, int32, -1 for none; weight (n, j); rest, displacement (p, 3) [m] and
-    displacement gradient (p, 3, 3) of the keypoints.
-    """
-    where = kernel_device(means)
-    if where != means.device:
-        given = (index, weight, rest, displacement, gradient, means, quats, scales)
-        return tuple(x.to(means.device) for x in skin_gaussians(*(t.to(where) for t in given)))
-    n, device = len(means), device_of(means)
-    out = [torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales), means.new_empty(n, 3, 3)]
+    binding: Binding, keypoints: KeypointMotion, gaussians: Gaussians
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"], Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Deformed means [m], quats, scales [m] and rotations of Gaussians that are bound to keypoints."""
+    g, where = gaussians, kernel_device(gaussians.means)
+    given = {name: getattr(g, name).to(where).contiguous() for name in ("means", "quats", "scales")}
+    moved = {name: torch.empty_like(x) for name, x in given.items()}
+    n, device, rotation = len(g), device_of(given["means"]), given["means"].new_empty(len(g), 3, 3)
     inputs = [
-        view(index), view(weight), view(rest.contiguous(), wp.vec3), view(displacement.contiguous(), wp.vec3),
-        view(gradient.contiguous(), wp.mat33), view(means, wp.vec3), view(quats, wp.vec4), view(scales, wp.vec3),
+        with_arrays(BindingArrays(), {"index": binding.index.to(where), "weight": binding.weight.to(where)}),
+        with_arrays(KeypointMotionArrays(), {name: x.to(where) for name, x in keypoints._asdict().items()}),
+        with_arrays(Ellipsoids(), given), with_arrays(Ellipsoids(), moved), view(rotation, wp.mat33),
     ]  # fmt: skip
-    outputs = [view(out[0], wp.vec3), view(out[1], wp.vec4), view(out[2], wp.vec3), view(out[3], wp.mat33)]
     if device != "cpu":
-        launch(_skin, n, [0, *inputs], outputs, device)
-        return tuple(out)
-    halves = [
-        wp.launch(_skin, b - a, [a, *inputs], outputs, device=device, record_cmd=True, record_tape=False)
-        for a, b in ((0, n // 2), (n // 2, n)) if b > a
-    ]  # fmt: skip
-    run_parallel([half.launch for half in halves])
-    return tuple(out)
+        launch(_skin, n, [0, *inputs], device=device)
+    else:
+        halves = [
+            wp.launch(_skin, b - a, [a, *inputs], device=device, record_cmd=True, record_tape=False)
+            for a, b in ((0, n // 2), (n // 2, n)) if b > a
+        ]  # fmt: skip
+        run_parallel([half.launch for half in halves])
+    means, quats, scales, rotation = (x.to(g.means.device) for x in (*moved.values(), rotation))
+    return means, quats, scales, rotation
 
 
 def skin_gaussians_reference(
-    index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
-    means: Tensor, quats: Tensor, scales: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    binding: Binding, keypoints: KeypointMotion, gaussians: Gaussians
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"], Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """`skin_gaussians` in PyTorch, in any precision."""
-    w = torch.where(index >= 0, weight, 0)
-    k = index.clamp_min(0).long()
+    g, (rest, displacement, gradient) = gaussians, keypoints
+    w = torch.where(binding.index >= 0, binding.weight, 0)
+    k = binding.index.clamp_min(0).long()
     G = (w[..., None, None] * gradient[k]).sum(1)
-    shift = (w[..., None] * (displacement[k] + (gradient[k] @ (means[:, None] - rest[k])[..., None])[..., 0])).sum(1)
+    shift = (w[..., None] * (displacement[k] + (gradient[k] @ (g.means[:, None] - rest[k])[..., None])[..., 0])).sum(1)
     F = torch.eye(3).to(G) + G
-    U, s, _ = torch.linalg.svd(F @ matrix(quats) * scales[:, None, :])
+    U, s, _ = torch.linalg.svd(F @ matrix(g.quats) * g.scales[:, None, :])
     U = torch.cat([U[..., :2], U[..., 2:] * torch.linalg.det(U)[:, None, None]], -1)
     still = (G == 0).all(-1).all(-1)
-    new_quats = torch.where(still[:, None], quats, quaternion(U))
-    new_scales = torch.where(still[:, None], scales, s)
+    new_quats = torch.where(still[:, None], g.quats, quaternion(U))
+    new_scales = torch.where(still[:, None], g.scales, s)
     R = torch.where(still[:, None, None], torch.eye(3).to(F), nearest_rotation(F))
-    return means + shift, new_quats, new_scales, R
+    return g.means + shift, new_quats, new_scales, R

@@ -10,7 +10,7 @@ from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import quaternion
 from stages.core.kernels.nearest_rotations import nearest_rotations
-from stages.core.kernels.skinning import skin_gaussians
+from stages.core.kernels.skinning import KeypointMotion, skin_gaussians
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
 
@@ -25,8 +25,7 @@ class Skinning:
         device = gaussians.means.device  # everything a frame needs; binding and keypoints stay on their own
         self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous().to(device)
         moving = (binding.index >= 0).any(1).nonzero()[:, 0]
-        self._index = binding.index[moving].int().contiguous().to(device)
-        self._weight = binding.weight[moving].float().contiguous().to(device)
+        self._binding = Binding(binding.index[moving].int().to(device), binding.weight[moving].float().to(device))
         self._moving = moving.to(device)
         self._part = gaussians[self._moving]
         self._neighbours_of = keypoint_neighbours(keypoints).to(device)
@@ -45,11 +44,7 @@ class Skinning:
         u = positions.to(self.rest) - self.rest
         if not len(self._moving) or not bool(u.any()):
             return g
-        G = self._gradients(u)
-        means, quats, scales, R = skin_gaussians(
-            self._index, self._weight, self.rest, u, G,
-            part.means.contiguous(), part.quats.contiguous(), part.scales.contiguous(),
-        )  # fmt: skip
+        means, quats, scales, R = skin_gaussians(self._binding, KeypointMotion(self.rest, u, self._gradients(u)), part)
         moved = {"means": means, "quats": quats, "scales": scales, "sh": _rotate_sh(part.sh, R)}
         whole = {name: getattr(g, name).index_copy(0, self._moving, value) for name, value in moved.items()}
         return Gaussians(**whole, opacities=g.opacities, object_id=g.object_id)

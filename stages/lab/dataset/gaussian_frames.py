@@ -21,13 +21,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import covariance
-from stages.core.kernels.skinning import skin_gaussians
+from stages.core.kernels.skinning import KeypointMotion, skin_gaussians
 from stages.core.models.initial_conditions import FLOOR
 from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, nearest_weights
 from stages.core.physics.particles import MIN_PARTICLE_OPACITY
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.trajectory import Binding
 from stages.lab.dataset.layout import Layout, object_kind
 from stages.lab.dataset.object_particles import Asset, at_scale_prior
 from stages.lab.dataset.scene_configs import SceneConfig
@@ -84,8 +85,8 @@ class SkinnedScene:
         for i in config.ids:
             index.append(skins[i].index + start)
             start += len(assets[i].points)
-        self._index = torch.cat(index).to(device)
-        self._weight = torch.cat([skins[i].weight for i in config.ids]).to(device)
+        weight = torch.cat([skins[i].weight for i in config.ids])
+        self._binding = Binding(torch.cat(index).to(device), weight.to(device))
         bodies = [assets[i].points + torch.tensor(p) for i, p in zip(config.ids, config.translation, strict=True)]
         self._particles = torch.cat(bodies).to(device)
 
@@ -94,11 +95,9 @@ class SkinnedScene:
 
         All are on the device of the scene. Spherical harmonics are not rotated (as published).
         """
-        g, identity = self.rest, torch.eye(3, device=x.device)
-        means, quats, scales, R = skin_gaussians(self._index, self._weight, self._particles, x - self._particles,
-                                                 F - identity, g.means.contiguous(), g.quats.contiguous(),
-                                                 g.scales.contiguous())  # fmt: skip
-        return replace(g, means=means, quats=quats, scales=scales), R
+        motion = KeypointMotion(self._particles, x - self._particles, F - torch.eye(3, device=x.device))
+        means, quats, scales, R = skin_gaussians(self._binding, motion, self.rest)
+        return replace(self.rest, means=means, quats=quats, scales=scales), R
 
 
 def write_frames(folder: Path, scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor]) -> None:

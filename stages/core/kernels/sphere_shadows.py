@@ -6,6 +6,7 @@ object takes two logarithms, of products over its spheres.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.kernels.interop import device_of, kernel_device, launch, view
+from stages.core.kernels.interop import device_of, empty_arrays, kernel_device, launch, view, with_arrays
 from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
@@ -30,98 +31,133 @@ class Lamp(NamedTuple):
     spread: float
 
 
+@dataclass(frozen=True)
+class Spheres:
+    """Spheres of the objects, those of an object next to each other."""
+
+    centres: Float[Tensor, "m 3"]
+    radii: Float[Tensor, "m"]
+    weights: Float[Tensor, "m"]  # exponents of what a sphere lets pass, the same for all of an object
+    object_id: Int[Tensor, "m"]
+
+    def to(self, device: torch.device | str) -> Spheres:
+        """The spheres on a device."""
+        return Spheres(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@wp.struct
+class ShadedPoints:
+    """Points, and the objects that do not shade them: their own."""
+
+    at: wp.array[wp.vec3]
+    own: wp.array[wp.int64]
+
+
+@wp.struct
+class SphereArrays:
+    """Spheres for kernels; at the first sphere of each object, what bounds those of the object."""
+
+    centres: wp.array[wp.vec3]
+    radii: wp.array[float]
+    weights: wp.array[float]
+    object_id: wp.array[wp.int64]
+    middles: wp.array[wp.vec3]  # mean of the object's centres
+    reaches: wp.array[float]  # how far its spheres extend from there
+    ends: wp.array[int]  # one past the last of them
+
+
+@wp.struct
+class LampDisc:
+    """Lamp for kernels."""
+
+    direction: wp.vec3
+    spread: float
+
+
 @wp.kernel
-def _bound(
-    centres: wp.array[wp.vec3], radii: wp.array[float], ids: wp.array[wp.int64], middles: wp.array[wp.vec3],
-    reaches: wp.array[float], ends: wp.array[int],
-):  # fmt: skip
-    """At the first sphere of each object: the mean of its centres, how far it extends from there, and one past its last
-    sphere."""
+def _bound(spheres: SphereArrays):
+    """Find the bounds of each object, at its first sphere."""
     first = wp.tid()
-    ends[first] = first
-    if first > 0 and ids[first - 1] == ids[first]:
+    spheres.ends[first] = first
+    if first > 0 and spheres.object_id[first - 1] == spheres.object_id[first]:
         return
     end = int(first)
     middle = wp.vec3()
-    while end < ids.shape[0] and ids[end] == ids[first]:
-        middle += centres[end]
+    while end < spheres.object_id.shape[0] and spheres.object_id[end] == spheres.object_id[first]:
+        middle += spheres.centres[end]
         end += 1
     middle /= float(end - first)
     reach = wp.float32(0.0)
     for j in range(first, end):
-        reach = wp.max(reach, wp.length(centres[j] - middle) + radii[j])
-    middles[first] = middle
-    reaches[first] = reach
-    ends[first] = end
+        reach = wp.max(reach, wp.length(spheres.centres[j] - middle) + spheres.radii[j])
+    spheres.middles[first] = middle
+    spheres.reaches[first] = reach
+    spheres.ends[first] = end
 
 
 @wp.kernel
 def _block(
-    start: int, piece: int, points: wp.array[wp.vec3], own: wp.array[wp.int64], centres: wp.array[wp.vec3],
-    radii: wp.array[float], weights: wp.array[float], ids: wp.array[wp.int64], middles: wp.array[wp.vec3],
-    reaches: wp.array[float], ends: wp.array[int], direction: wp.vec3, spread: float, out: wp.array2d[float],
+    start: int, piece: int, points: ShadedPoints, spheres: SphereArrays, lamp: LampDisc, out: wp.array2d[float]
 ):  # fmt: skip
     i = start + wp.tid()
-    x = points[i]
+    x = points.at[i]
     sky_log = wp.float32(0.0)
     lamp_log = wp.float32(0.0)
     first = wp.int32(0)
-    while first < ids.shape[0]:
-        end = ends[first]
-        d = middles[first] - x
-        R = reaches[first]
+    while first < spheres.object_id.shape[0]:
+        end = spheres.ends[first]
+        d = spheres.middles[first] - x
+        R = spheres.reaches[first]
         square = wp.dot(d, d)
-        along = wp.dot(direction, d)
+        along = wp.dot(lamp.direction, d)
         across = wp.sqrt(wp.max(square - along * along, 0.0))
         near = R * R * (d[2] + R) > wp.static(MIN_EFFECT) * square * wp.sqrt(square)
-        near = near or (along > -R and across < R + spread * (along + R))
-        if near and ids[first] != own[i]:
-            sky = wp.float32(1.0)
-            lamp = wp.float32(1.0)
+        near = near or (along > -R and across < R + lamp.spread * (along + R))
+        if near and spheres.object_id[first] != points.own[i]:
+            past_sky = wp.float32(1.0)
+            past_lamp = wp.float32(1.0)
             for j in range(first, end):
-                c = centres[j] - x
-                r = radii[j]
+                c = spheres.centres[j] - x
+                r = spheres.radii[j]
                 square = wp.max(wp.dot(c, c), 1.0e-12)
                 hidden = wp.max(c[2] / wp.sqrt(square), 0.0) * wp.min(r * r / square, 1.0)
-                sky *= 1.0 - wp.min(hidden, wp.static(MAX_BLOCKED))
-                along = wp.dot(direction, c)
+                past_sky *= 1.0 - wp.min(hidden, wp.static(MAX_BLOCKED))
+                along = wp.dot(lamp.direction, c)
                 if along > 0.0:
                     across = wp.sqrt(wp.max(square - along * along, 0.0))
-                    disc = wp.max(spread * along, 1.0e-6)  # radius of the lamp, seen at the distance of the sphere
+                    disc = wp.max(lamp.spread * along, 1.0e-6)  # radius of the lamp, seen at the distance of the sphere
                     edge = wp.clamp((across - wp.abs(disc - r)) / (2.0 * wp.min(disc, r)), 0.0, 1.0)
                     hidden = wp.min(r * r / (disc * disc), 1.0) * (1.0 - edge * edge * (3.0 - 2.0 * edge))
-                    lamp *= 1.0 - wp.min(hidden, wp.static(MAX_BLOCKED))
-                if j + 1 == end or wp.min(sky, lamp) < 1.0e-30:  # before the products vanish
-                    sky_log += weights[first] * wp.log(sky)
-                    lamp_log += weights[first] * wp.log(lamp)
-                    sky = 1.0
-                    lamp = 1.0
+                    past_lamp *= 1.0 - wp.min(hidden, wp.static(MAX_BLOCKED))
+                if j + 1 == end or wp.min(past_sky, past_lamp) < 1.0e-30:  # before the products vanish
+                    sky_log += spheres.weights[first] * wp.log(past_sky)
+                    lamp_log += spheres.weights[first] * wp.log(past_lamp)
+                    past_sky = 1.0
+                    past_lamp = 1.0
         first = end
     out[i, 0] = 1.0 - wp.exp(sky_log)
     out[i, 1] = 1.0 - wp.exp(lamp_log)
 
 
 def blocked_light(
-    points: Float[Tensor, "n 3"], own: Int[Tensor, "n"], centres: Float[Tensor, "m 3"], radii: Float[Tensor, "m"],
-    weights: Float[Tensor, "m"], ids: Int[Tensor, "m"], lamp: Lamp,
+    points: Float[Tensor, "n 3"], own: Int[Tensor, "n"], spheres: Spheres, lamp: Lamp
 ) -> Float[Tensor, "n 2"]:  # fmt: skip
-    """Fractions of the sky and of the lamp that the spheres block at points.
+    """Fractions of the sky and of the lamp that the spheres block at points of their `own` objects.
 
-    `ids` are the objects of the spheres, those of an object next to each other and of one weight; they do not shade
-    points of their `own` object.
+    The spheres of an object do not shade its own points.
     """
     where = kernel_device(points)
     if where != points.device:
-        given = (t.to(where) for t in (points, own, centres, radii, weights, ids))
-        return blocked_light(*given, lamp).to(points.device)
-    device, m = device_of(points), len(radii)
-    middles, reaches = torch.empty_like(centres), torch.empty_like(radii)
-    ends, out = torch.empty(m, dtype=torch.int32, device=points.device), points.new_empty(len(points), 2)
-    spheres = [view(centres.contiguous(), wp.vec3), view(radii.contiguous()), view(ids.contiguous())]
-    bounds = [view(middles, wp.vec3), view(reaches), view(ends)]
-    launch(_bound, m, spheres, bounds, device)
-    inputs = [view(points.contiguous(), wp.vec3), view(own.contiguous()), *spheres[:2], view(weights.contiguous()),
-              spheres[2], *bounds, wp.vec3(*lamp.direction), lamp.spread, view(out)]  # fmt: skip
+        return blocked_light(points.to(where), own.to(where), spheres.to(where), lamp).to(points.device)
+    device, m, out = device_of(points), len(spheres.radii), points.new_empty(len(points), 2)
+    shading = empty_arrays(SphereArrays, device, (m,), centres=None, radii=None, weights=None, object_id=None)
+    with_arrays(shading, {name: getattr(spheres, name) for name in ("centres", "radii", "weights")})
+    shading.object_id = view(spheres.object_id.contiguous())
+    shaded, disc = ShadedPoints(), LampDisc()
+    shaded.at, shaded.own = view(points.contiguous(), wp.vec3), view(own.contiguous())
+    disc.direction, disc.spread = wp.vec3(*lamp.direction), lamp.spread
+    launch(_bound, m, [shading], device=device)
+    inputs = [shaded, shading, disc, view(out)]
     if device != "cpu":
         launch(_block, len(points), [0, 0, *inputs], device=device)
     else:
@@ -130,10 +166,10 @@ def blocked_light(
 
 
 def blocked_light_reference(
-    points: Float[Tensor, "n 3"], own: Int[Tensor, "n"], centres: Float[Tensor, "m 3"], radii: Float[Tensor, "m"],
-    weights: Float[Tensor, "m"], ids: Int[Tensor, "m"], lamp: Lamp,
+    points: Float[Tensor, "n 3"], own: Int[Tensor, "n"], spheres: Spheres, lamp: Lamp
 ) -> Float[Tensor, "n 2"]:  # fmt: skip
     """`blocked_light` in PyTorch, in any precision."""
+    centres, radii, weights, ids = spheres.centres, spheres.radii, spheres.weights, spheres.object_id
     objects, of = ids.unique(return_inverse=True)
     light = torch.tensor(lamp.direction).to(points)
     middle = torch.stack([centres[of == k].mean(0) for k in range(len(objects))])

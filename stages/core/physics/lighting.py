@@ -11,8 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.harmonics import C0
+from stages.core.kernels.sphere_shadows import Spheres
 from stages.core.perception.support import Support, cell_medians, find_support
-from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, Spheres, blocked
+from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, blocked
 from stages.core.scene.gaussians import SURFACE_OPACITY
 from stages.core.scene.scene import Scene
 

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.cells import distinct_cells
+from stages.core.kernels.sphere_shadows import Spheres
 from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, farthest_points, nearest_weights
 from stages.core.physics.particles import sample_bodies
 from stages.core.physics.skinning import Skinning
-from stages.core.raster.shadows import Spheres
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints

@@ -16,14 +16,14 @@ E at rest (in linear light). web/shaders.js of the player computes the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import C0
-from stages.core.kernels.sphere_shadows import Lamp, blocked_light
+from stages.core.kernels.sphere_shadows import Lamp, Spheres, blocked_light
 from stages.core.scene.gaussians import Gaussians
 
 GAMMA = 2.2  # of the colours; irradiance is linear
@@ -44,20 +44,6 @@ class Light:
 OVERHEAD = Light(0.5, 0.3, (0.0, 0.0, 1.0), 0.6, in_colours=False)  # where the photos show no shadows
 
 
-@dataclass(frozen=True)
-class Spheres:
-    """Spheres of the objects, those of an object next to each other."""
-
-    centres: Float[Tensor, "m 3"]
-    radii: Float[Tensor, "m"]
-    weights: Float[Tensor, "m"]  # w, the same for all spheres of an object
-    object_id: Int[Tensor, "m"]
-
-    def to(self, device: torch.device | str) -> Spheres:
-        """The spheres on a device."""
-        return Spheres(*(getattr(self, field.name).to(device) for field in fields(self)))
-
-
 def irradiance(
     points: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], spheres: Spheres, light: Light
 ) -> Float[Tensor, "n"]:
@@ -70,10 +56,7 @@ def blocked(
     points: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], spheres: Spheres, light: Light
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """The fractions 1 - V of the sky and of the lamp that the spheres block at points of objects `ids`."""
-    lamp = Lamp(light.direction, light.spread)
-    shade = blocked_light(
-        points, ids, spheres.centres, spheres.radii, spheres.weights, spheres.object_id, lamp
-    )  # fmt: skip
+    shade = blocked_light(points, ids, spheres, Lamp(light.direction, light.spread))
     return shade[:, 0], shade[:, 1]
 
 

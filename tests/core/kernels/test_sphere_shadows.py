@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from stages.core.kernels.sphere_shadows import Lamp, blocked_light, blocked_light_reference
+from stages.core.kernels.sphere_shadows import Lamp, Spheres, blocked_light, blocked_light_reference
 
 LAMPS = [Lamp((0.6, 0.0, 0.8), 0.2), Lamp((0.0, 0.0, 1.0), 0.6)]
 
 
-def world(device: str, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
-    """Four objects of eight spheres, one of them so large and near that products of a few factors would vanish."""
+def world(device: str, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor, Spheres]:
+    """Points, and four objects of eight spheres, one so large and near that products of a few factors would vanish."""
     rng = torch.Generator().manual_seed(0)
     points = torch.rand(3000, 3, generator=rng) * torch.tensor([2.0, 2.0, 0.5]) - torch.tensor([1.0, 1.0, 0.1])
     own = torch.randint(0, 6, (3000,), generator=rng)
@@ -18,8 +18,8 @@ def world(device: str, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]
     radii = 0.02 + 0.05 * torch.rand(32, generator=rng)
     centres[:8], radii[:8] = torch.tensor([0.0, 0.0, 0.6]), 0.5
     weights = torch.tensor([0.9, 0.3, 1.0, 0.6]).repeat_interleave(8)
-    return [t.to(device, dtype) if t.is_floating_point() else t.to(device) for t in
-            (points, own, centres, radii, weights, ids)]  # fmt: skip
+    spheres = Spheres(centres.to(dtype), radii.to(dtype), weights.to(dtype), ids)
+    return points.to(device, dtype), own.to(device), spheres.to(device)
 
 
 @pytest.mark.parametrize("lamp", LAMPS)
@@ -34,6 +34,7 @@ def test_equals_the_reference(device, lamp):
 
 
 def test_no_points_and_no_spheres(device):
-    points, own, *spheres = world(device)
-    assert blocked_light(points[:0], own[:0], *spheres, LAMPS[0]).shape == (0, 2)
-    assert not blocked_light(points, own, *(s[:0] for s in spheres), LAMPS[0]).any()
+    points, own, spheres = world(device)
+    assert blocked_light(points[:0], own[:0], spheres, LAMPS[0]).shape == (0, 2)
+    none = Spheres(*(values[:0] for values in vars(spheres).values()))
+    assert not blocked_light(points, own, none, LAMPS[0]).any()

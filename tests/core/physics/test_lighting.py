@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.core.kernels.sphere_shadows import Spheres
 from stages.core.perception.support import find_support
 from stages.core.physics import lighting
 from stages.core.physics.lighting import _best_fit, _lamps, _surface_terms
-from stages.core.raster.shadows import Light, Spheres
+from stages.core.raster.shadows import Light
 from stages.core.scene.gaussians import concatenate
 from tests.conftest import two_balls_scene
 

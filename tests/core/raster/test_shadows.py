@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from stages.core.geometry.harmonics import C0
-from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, Spheres, blocked, irradiance, shaded, shadow_factor
+from stages.core.kernels.sphere_shadows import Spheres
+from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, blocked, irradiance, shaded, shadow_factor
 from tests.conftest import random_gaussians
 from tests.core.raster.lit_world import RADIUS, REST, floor_irradiance
 

@@ -25,6 +25,7 @@ GRAIN_SIZE = 32768  # elements per thread below which PyTorch does not use anoth
 
 _FOLLOW = r"""
 __shared__ float before[258], lowest_of_warp[8];
+const int steps = costs.shape[0], lines = costs.shape[1], labels = costs.shape[2];
 const int t = threadIdx.x;
 const float none = INFINITY;
 for (int direction = 0; direction < 2; ++direction) {
@@ -56,17 +57,13 @@ for (int direction = 0; direction < 2; ++direction) {
 
 @wp.func_native(by_device(_FOLLOW, ""))
 def _follow(
-    line: int, steps: int, lines: int, labels: int, step_penalty: float, jump_penalty: float, costs: wp.array[float],
-    total: wp.array[float],
+    line: int, costs: wp.array3d[float], step_penalty: float, jump_penalty: float, total: wp.array3d[float]
 ): ...  # fmt: skip
 
 
 @wp.kernel
-def _paths(
-    steps: int, lines: int, labels: int, step_penalty: float, jump_penalty: float, costs: wp.array[float],
-    total: wp.array[float],
-):  # fmt: skip
-    _follow(wp.tid() // wp.static(THREADS), steps, lines, labels, step_penalty, jump_penalty, costs, total)
+def _paths(costs: wp.array3d[float], step_penalty: float, jump_penalty: float, total: wp.array3d[float]):
+    _follow(wp.tid() // wp.static(THREADS), costs, step_penalty, jump_penalty, total)
 
 
 def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float) -> Float[Tensor, "l m d"]:
@@ -74,7 +71,7 @@ def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty:
 
     A change of the label by one costs `step_penalty`, any other `jump_penalty`.
     """
-    steps, lines, labels = costs.shape
+    _, lines, labels = costs.shape
     if not costs.is_cuda:
         parts = costs.chunk(min(torch.get_num_threads(), -(-lines * labels // GRAIN_SIZE)), dim=1)
         return torch.cat(parallel_map(lambda part: path_costs_reference(part, step_penalty, jump_penalty), parts), 1)
@@ -82,7 +79,7 @@ def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty:
         return path_costs_reference(costs, step_penalty, jump_penalty)
     costs = costs.contiguous()
     total = torch.empty_like(costs)
-    arguments = [steps, lines, labels, step_penalty, jump_penalty, view(costs.view(-1)), view(total.view(-1))]
+    arguments = [view(costs), step_penalty, jump_penalty, view(total)]
     launch(_paths, THREADS * lines, arguments, device=device_of(costs), block_dim=THREADS)
     return total
 

@@ -28,23 +28,25 @@ def rotated(quat: wp.vec4, rotation: wp.vec3):
     return wp.vec4(q[3], q[0], q[1], q[2])
 
 
+@wp.struct
+class Placement:
+    """Where bodies are."""
+
+    com: wp.array[wp.vec3]  # centre of mass [m]
+    quat: wp.array[wp.vec4]
+
+
 @wp.kernel(enable_backward=False)
 def _drift(
-    com: wp.array[wp.vec3],
-    quat: wp.array[wp.vec4],
-    velocity: wp.array[wp.vec3],
-    momentum: wp.array[wp.vec3],
-    inverse: wp.array[wp.mat33],
-    dt: float,
-    new_com: wp.array[wp.vec3],
-    new_quat: wp.array[wp.vec4],
-):
+    start: Placement, velocity: wp.array[wp.vec3], momentum: wp.array[wp.vec3], inverse: wp.array[wp.mat33], dt: float,
+    end: Placement,
+):  # fmt: skip
     i = wp.tid()
-    q, L = quat[i], momentum[i]
+    q, L = start.quat[i], momentum[i]
     spin = spin_of(L, inverse[i], matrix(q))
     spin = spin_of(L, inverse[i], matrix(rotated(q, dt / 2.0 * spin)))
-    new_com[i] = com[i] + dt * velocity[i]
-    new_quat[i] = rotated(q, dt * spin)
+    end.com[i] = start.com[i] + dt * velocity[i]
+    end.quat[i] = rotated(q, dt * spin)
 
 
 @wp.kernel(enable_backward=False)
@@ -57,6 +59,12 @@ def _pose(quat: wp.array[wp.vec4], momentum: wp.array[wp.vec3], inverse: wp.arra
 
 def _rows(x: Tensor, dims: int, dtype) -> wp.array:
     return view(x.contiguous().flatten(0, -1 - dims), dtype)
+
+
+def _placement(com: Tensor, quat: Tensor) -> Placement:
+    out = Placement()
+    out.com, out.quat = _rows(com, 1, wp.vec3), _rows(quat, 1, wp.vec4)
+    return out
 
 
 def _drift_shapes(com, quat, velocity, momentum, inverse, dt):
@@ -73,10 +81,10 @@ def drift(
     Reference: `stages.core.models.field.rigid_body.drift`.
     """
     moved, turned = com.new_empty(com.shape), quat.new_empty(quat.shape)
-    launch(_drift, com[..., 0].numel(), [
-        _rows(com, 1, wp.vec3), _rows(quat, 1, wp.vec4), _rows(velocity, 1, wp.vec3), _rows(momentum, 1, wp.vec3),
-        _rows(inverse, 2, wp.mat33), dt,
-    ], [_rows(moved, 1, wp.vec3), _rows(turned, 1, wp.vec4)], device_of(com))  # fmt: skip
+    launch(_drift, com.numel() // 3, [
+        _placement(com, quat), _rows(velocity, 1, wp.vec3), _rows(momentum, 1, wp.vec3), _rows(inverse, 2, wp.mat33),
+        dt, _placement(moved, turned),
+    ], device=device_of(com))  # fmt: skip
     return moved, turned
 
 
@@ -91,7 +99,7 @@ def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tenso
     Reference: `stages.core.models.field.rigid_body.pose`.
     """
     R, spin = inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)
-    launch(_pose, momentum[..., 0].numel(), [
+    launch(_pose, momentum.numel() // 3, [
         _rows(quat, 1, wp.vec4), _rows(momentum, 1, wp.vec3), _rows(inverse, 2, wp.mat33),
     ], [_rows(R, 2, wp.mat33), _rows(spin, 1, wp.vec3)], device_of(quat))  # fmt: skip
     return R, spin

@@ -9,7 +9,8 @@ import torch
 import warp as wp
 
 from stages.core.kernels.field import contact_solve as kernels
-from stages.core.kernels.interop import empty_arrays, launch, with_arrays
+from stages.core.kernels.field.groups import GroupThread
+from stages.core.kernels.interop import launch, with_arrays
 from tests.core.kernels import contact_reference as reference
 from tests.core.kernels.contact_reference import BodyInertia, Contacts
 
@@ -17,12 +18,11 @@ GROUP = {"cpu": 1, "cuda": 64}  # threads
 
 
 @wp.kernel(enable_backward=False)
-def _solve(
-    c: kernels.Contacts, inertia: kernels.Inertias, memory: kernels.SolverMemory, v: kernels.Velocities,
-    free: kernels.Velocities, lanes: int,
-):  # fmt: skip
-    bodies = inertia.mass.shape[1]
-    kernels.solve(c, inertia, memory, v, free, wp.tid() // lanes, wp.tid() % lanes, lanes, bodies)
+def _solve(solver: kernels.ContactSolver, lanes: int):
+    thread = GroupThread()
+    thread.lane = wp.tid()
+    thread.lanes = lanes
+    kernels.solve(solver, thread)
 
 
 def solve(
@@ -32,7 +32,7 @@ def solve(
     o, group = len(bodies.mass), GROUP[device]
     pair = contacts.a * o + contacts.b
     order = pair.argsort(stable=True)
-    c, memory = kernels.solver_arrays(device, 1, o, len(pair), group)
+    solver = kernels.contact_solver(device, 1, o, len(pair), group)
     first = torch.searchsorted(pair[order].contiguous(), torch.arange(o * o + 1)).int()
     active = (first.diff() > 0).nonzero()[:, 0]
 
@@ -52,20 +52,20 @@ def solve(
     own = {k: x[order][None].to(device) for k, x in own.items()}
     counts = {"first": first[None], "active": torch.nn.functional.pad(active, (0, o * o - len(active)))[None],
               "active_count": torch.tensor([len(active)])}  # fmt: skip
-    c = with_arrays(c, own | {k: x.to(device) for k, x in counts.items()})
-    inertia = with_arrays(kernels.Inertias(), {
+    with_arrays(solver.contacts, own | {k: x.to(device) for k, x in counts.items()})
+    with_arrays(solver.inertia, {
         "mass": bodies.mass.float()[None].to(device), "tensor": bodies.inertia[None].to(device),
         "inverse": bodies.inverse[None].to(device), "pinned": bodies.pinned[None].to(device),
     })  # fmt: skip
 
     def velocities(x):
         x = torch.where(bodies.pinned[:, None], 0.0, x)[None].to(device)
-        parts = {"linear": x[..., :3].contiguous(), "angular": x[..., 3:].contiguous()}
-        return with_arrays(empty_arrays(kernels.Velocities, device, (1, o)), parts), parts
+        return {"linear": x[..., :3].contiguous(), "angular": x[..., 3:].contiguous()}
 
-    v, moved = velocities(start)
-    free, _ = velocities(bodies.velocity)
-    launch(_solve, group, [c, inertia, memory, v, free, group], device=device, block_dim=group)
+    moved = velocities(start)
+    with_arrays(solver.velocities, moved)
+    with_arrays(solver.free, velocities(bodies.velocity))
+    launch(_solve, group, [solver, group], device=device, block_dim=group)
     impulse = torch.empty_like(own["impulse"][0].cpu())
     impulse[order] = own["impulse"][0].cpu()
     return torch.cat([moved["linear"], moved["angular"]], -1)[0].cpu(), impulse

@@ -12,7 +12,7 @@ from __future__ import annotations
 import warp as wp
 
 from stages.core.geometry import surface_faces as faces
-from stages.core.kernels.field.groups import wait_for_group
+from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.field.surface_lookup import SurfaceArrays, beyond_grid, closest_point, depth_at, nearest_node
 
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
@@ -30,17 +30,19 @@ NO_DISTANCE = wp.constant(1e-6)  # in radii of a ball, that has no direction
 
 
 @wp.struct
-class BodyPoses:
-    """Where the bodies of each scene are."""
+class BodyMotion:
+    """Where the bodies of each scene are, and how they move."""
 
     com: wp.array2d[wp.vec3]
+    quat: wp.array2d[wp.vec4]
     R: wp.array2d[wp.mat33]
+    velocity: wp.array2d[wp.vec3]
+    momentum: wp.array2d[wp.vec3]  # angular, per unit of mass
+    spin: wp.array2d[wp.vec3]
     low: wp.array2d[wp.vec3]  # the room of each body
     high: wp.array2d[wp.vec3]
     margin: wp.array2d[float]  # gap up to which contacts are looked for [m]
     pinned: wp.array2d[wp.bool]
-    velocity: wp.array2d[wp.vec3]
-    spin: wp.array2d[wp.vec3]
     step: float  # [s]
 
 
@@ -60,9 +62,20 @@ class Found:
 
 
 @wp.struct
+class CollisionWorld:
+    """The surfaces of the bodies of each scene, where these are, and what of them is near others."""
+
+    surfaces: SurfaceArrays
+    motion: BodyMotion
+    found: Found
+
+
+@wp.struct
 class NearPoint:
     """A point of body a near body b or near a plane."""
 
+    a: int
+    b: int  # a at a plane
     at: wp.vec3  # of a [m]
     gap: float  # [m]
     normal: wp.vec3  # of b, towards a
@@ -78,34 +91,36 @@ def _inward(side: int) -> wp.vec3:
 
 
 @wp.func
-def _plane_gap(poses: BodyPoses, scene: int, a: int, side: int, x: wp.vec3) -> float:
+def _plane_gap(motion: BodyMotion, scene: int, a: int, side: int, x: wp.vec3) -> float:
     axis = side % 3
     if side < 3:
-        return x[axis] - poses.low[scene, a][axis]
-    return poses.high[scene, a][axis] - x[axis]
+        return x[axis] - motion.low[scene, a][axis]
+    return motion.high[scene, a][axis] - x[axis]
 
 
 @wp.func
-def _local(poses: BodyPoses, scene: int, body: int, x: wp.vec3) -> wp.vec3:
-    return wp.transpose(poses.R[scene, body]) * (x - poses.com[scene, body])
+def _local(motion: BodyMotion, scene: int, body: int, x: wp.vec3) -> wp.vec3:
+    return wp.transpose(motion.R[scene, body]) * (x - motion.com[scene, body])
 
 
 @wp.func
-def _relative_velocity(poses: BodyPoses, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
+def _relative_velocity(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
     """Velocity of body a relative to b at x."""
-    own = poses.velocity[scene, a] + wp.cross(poses.spin[scene, a], x - poses.com[scene, a])
-    return own - poses.velocity[scene, b] - wp.cross(poses.spin[scene, b], x - poses.com[scene, b])
+    own = motion.velocity[scene, a] + wp.cross(motion.spin[scene, a], x - motion.com[scene, a])
+    return own - motion.velocity[scene, b] - wp.cross(motion.spin[scene, b], x - motion.com[scene, b])
 
 
 @wp.func
-def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, q: int) -> NearPoint:
+def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
     """Sample q of body a at body b."""
     out = NearPoint()
-    R = poses.R[scene, b]
-    out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
-    x = _local(poses, scene, b, out.at)
+    out.a = a
+    out.b = b
+    R = motion.R[scene, b]
+    out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
+    x = _local(motion, scene, b, out.at)
     found = depth_at(s, b, x)
-    way = poses.step * (wp.transpose(R) * _relative_velocity(poses, scene, a, b, out.at))
+    way = motion.step * (wp.transpose(R) * _relative_velocity(motion, scene, a, b, out.at))
     if wp.length(way) > STEP_OF_A_CELL * s.spacing[b]:
         later = depth_at(s, b, x + way)
         if later[3] < 0.0:  # it stays outside, and may pass an edge whose normal would stop it
@@ -113,7 +128,7 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
             found = later
     out.normal = -(R * wp.vec3(found[0], found[1], found[2]))
     out.gap = s.overlap[a, b] - found[3]
-    own = poses.R[scene, a] * s.normals[a, q]
+    own = motion.R[scene, a] * s.normals[a, q]
     out.facing = -wp.dot(own, out.normal) > MIN_FACING
     # Where b has an edge its depths increase in an oblique direction. The normal is that of a face: of faces that are
     # parallel the one of the flatter surface, else that of a if its sample is on one.
@@ -122,7 +137,7 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
     most = float(-1.0)
     opposite = wp.vec3()
     if r >= 0:
-        to_b = wp.transpose(R) * poses.R[scene, a]
+        to_b = wp.transpose(R) * motion.R[scene, a]
         for i in range(FACES):
             for j in range(FACES):
                 facing = -wp.dot(to_b * s.faces[p, i], s.faces[r, j])
@@ -139,17 +154,19 @@ def sample_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int, 
 
 
 @wp.func
-def ball_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) -> NearPoint:
+def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> NearPoint:
     """The point of a ball a that is nearest to body b."""
     out = NearPoint()
-    centre = poses.com[scene, a] + poses.R[scene, a] * s.centre[a]
-    apart = centre - (poses.com[scene, b] + poses.R[scene, b] * s.centre[b])
+    out.a = a
+    out.b = b
+    centre = motion.com[scene, a] + motion.R[scene, a] * s.centre[a]
+    apart = centre - (motion.com[scene, b] + motion.R[scene, b] * s.centre[b])
     out.normal = wp.normalize(apart)
     out.gap = wp.length(apart) - s.radius[a] - s.radius[b]
     if s.radius[b] == 0.0:
-        on = closest_point(s, b, _local(poses, scene, b, centre))
-        outward = centre - (poses.com[scene, b] + poses.R[scene, b] * on.at)
-        normal = poses.R[scene, b] * on.normal
+        on = closest_point(s, b, _local(motion, scene, b, centre))
+        outward = centre - (motion.com[scene, b] + motion.R[scene, b] * on.at)
+        normal = motion.R[scene, b] * on.normal
         side = wp.where(wp.dot(outward, normal) < 0.0, -1.0, 1.0)  # the centre may be inside
         out.gap = side * wp.length(outward) - s.radius[a]
         out.normal = wp.where(wp.length(outward) > NO_DISTANCE * s.radius[a], side * wp.normalize(outward), normal)
@@ -160,15 +177,17 @@ def ball_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) ->
 
 
 @wp.func
-def plane_near(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, side: int, q: int) -> NearPoint:
+def plane_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, side: int, q: int) -> NearPoint:
     """Sample q of body a, or the point of a ball, at a plane."""
     out = NearPoint()
+    out.a = a
+    out.b = a
     out.normal = _inward(side)
     if s.radius[a] > 0.0:
-        out.at = poses.com[scene, a] + poses.R[scene, a] * s.centre[a] - s.radius[a] * out.normal
+        out.at = motion.com[scene, a] + motion.R[scene, a] * s.centre[a] - s.radius[a] * out.normal
     else:
-        out.at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
-    out.gap = _plane_gap(poses, scene, a, side, out.at)
+        out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
+    out.gap = _plane_gap(motion, scene, a, side, out.at)
     out.facing = True
     return out
 
@@ -184,78 +203,78 @@ def _side_of(normal: wp.vec3) -> int:
 
 
 @wp.func
-def _possible(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, b: int) -> bool:
+def _possible(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> bool:
     """Whether contacts of body a with b, or with the planes if b = a, are to be looked for."""
-    if poses.pinned[scene, a] and (a == b or poses.pinned[scene, b]):
+    if motion.pinned[scene, a] and (a == b or motion.pinned[scene, b]):
         return False
     if a != b and s.radius[b] > 0.0 and (s.radius[a] == 0.0 or b < a):
         return False  # it is a contact of b with a
-    com = poses.com[scene, a]
+    com = motion.com[scene, a]
     if a != b:
-        reach = s.reach[a] + s.reach[b] + poses.margin[scene, a] + poses.margin[scene, b]
-        return wp.length(com - poses.com[scene, b]) < reach
+        reach = s.reach[a] + s.reach[b] + motion.margin[scene, a] + motion.margin[scene, b]
+        return wp.length(com - motion.com[scene, b]) < reach
     out = bool(False)
     for side in range(SIDES):
-        out = out or _plane_gap(poses, scene, a, side, com) < s.reach[a] + poses.margin[scene, a]
+        out = out or _plane_gap(motion, scene, a, side, com) < s.reach[a] + motion.margin[scene, a]
     return out
 
 
 @wp.func
-def _margin(poses: BodyPoses, scene: int, a: int, b: int) -> float:
-    return poses.margin[scene, a] + wp.where(a == b, 0.0, poses.margin[scene, b])
+def _margin(motion: BodyMotion, scene: int, a: int, b: int) -> float:
+    return motion.margin[scene, a] + wp.where(a == b, 0.0, motion.margin[scene, b])
 
 
 @wp.func
-def _look_at(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, q: int):
+def _look_at(w: CollisionWorld, scene: int, pair: int, q: int):
     """Sample q of a pair: its gap and the side of its normal, if it is near."""
-    a = pair // s.near.shape[0]
-    b = pair % s.near.shape[0]
-    found.side[scene, pair, q] = wp.int8(NONE)
-    if s.near[a, q] == NONE:
+    a = pair // w.surfaces.near.shape[0]
+    b = pair % w.surfaces.near.shape[0]
+    w.found.side[scene, pair, q] = wp.int8(NONE)
+    if w.surfaces.near[a, q] == NONE:
         return
-    margin = _margin(poses, scene, a, b)
-    at = poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+    margin = _margin(w.motion, scene, a, b)
+    at = w.motion.com[scene, a] + w.motion.R[scene, a] * w.surfaces.samples[a, q]
     if a == b:
         least = margin  # of a sample near several planes the nearest one counts
         for side in range(SIDES):
-            gap = _plane_gap(poses, scene, a, side, at)
+            gap = _plane_gap(w.motion, scene, a, side, at)
             if gap < least:
                 least = gap
-                found.gap[scene, pair, q] = gap
-                found.side[scene, pair, q] = wp.int8(side)
+                w.found.gap[scene, pair, q] = gap
+                w.found.side[scene, pair, q] = wp.int8(side)
         return
-    x = _local(poses, scene, b, at)
-    if beyond_grid(s, b, x) < margin:
-        point = sample_near(s, poses, scene, a, b, q)
+    x = _local(w.motion, scene, b, at)
+    if beyond_grid(w.surfaces, b, x) < margin:
+        point = sample_near(w.surfaces, w.motion, scene, a, b, q)
         if point.gap < margin and point.facing:
-            found.gap[scene, pair, q] = point.gap
-            found.side[scene, pair, q] = wp.int8(_side_of(point.normal))
-            found.other[scene, pair, q] = s.keypoint[nearest_node(s, b, x)]
+            w.found.gap[scene, pair, q] = point.gap
+            w.found.side[scene, pair, q] = wp.int8(_side_of(point.normal))
+            w.found.other[scene, pair, q] = w.surfaces.keypoint[nearest_node(w.surfaces, b, x)]
 
 
 @wp.func
-def _list_near(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int):
+def _list_near(w: CollisionWorld, scene: int, pair: int):
     count = int(0)
-    for q in range(s.near.shape[1]):
-        if found.side[scene, pair, q] != wp.int8(NONE):
-            found.near[scene, pair, count] = q
+    for q in range(w.surfaces.near.shape[1]):
+        if w.found.side[scene, pair, q] != wp.int8(NONE):
+            w.found.near[scene, pair, count] = q
             count += 1
-    found.near_count[scene, pair] = count
+    w.found.near_count[scene, pair] = count
 
 
 @wp.func
-def _keep_extremes(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, k: int):
+def _keep_extremes(w: CollisionWorld, scene: int, pair: int, k: int):
     """Fill the slots of the k-th direction on all sides."""
-    a = pair // s.near.shape[0]
+    a = pair // w.surfaces.near.shape[0]
     for side in range(SIDES):
-        found.row[scene, pair * SLOTS + side * EXTREMES + k] = NONE
-    for i in range(found.near_count[scene, pair]):
-        q = found.near[scene, pair, i]
-        side = int(found.side[scene, pair, q])
-        gap = found.gap[scene, pair, q]
+        w.found.row[scene, pair * SLOTS + side * EXTREMES + k] = NONE
+    for i in range(w.found.near_count[scene, pair]):
+        q = w.found.near[scene, pair, i]
+        side = int(w.found.side[scene, pair, q])
+        gap = w.found.gap[scene, pair, q]
         value = -gap
         if k < EXTREMES - 1:
-            arm = poses.R[scene, a] * s.samples[a, q]
+            arm = w.motion.R[scene, a] * w.surfaces.samples[a, q]
             u = arm[(side + 1) % 3]
             v = arm[(side + 2) % 3]
             if k < 4:  # diagonals
@@ -266,72 +285,74 @@ def _keep_extremes(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int,
                 value = wp.where(k == 6, v, -v)
             value -= GAP_WEIGHT * wp.max(gap, 0.0)
         slot = pair * SLOTS + side * EXTREMES + k
-        if found.row[scene, slot] == NONE or value > found.score[scene, slot]:
-            found.score[scene, slot] = value
-            found.row[scene, slot] = q
+        if w.found.row[scene, slot] == NONE or value > w.found.score[scene, slot]:
+            w.found.score[scene, slot] = value
+            w.found.row[scene, slot] = q
 
 
 @wp.func
-def _count_contacts(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int):
+def _count_contacts(w: CollisionWorld, scene: int, pair: int):
     """Empty slots whose sample is in an earlier one of the same side, and count the others; a ball has one contact."""
-    a = pair // s.near.shape[0]
-    b = pair % s.near.shape[0]
+    a = pair // w.surfaces.near.shape[0]
+    b = pair % w.surfaces.near.shape[0]
     count = int(0)
     for slot in range(SLOTS):
         at = pair * SLOTS + slot
-        if s.radius[a] > 0.0:
+        if w.surfaces.radius[a] > 0.0:
             touches = bool(False)
             if a == b and slot % EXTREMES == 0:
-                touches = plane_near(s, poses, scene, a, slot // EXTREMES, 0).gap < poses.margin[scene, a]
+                gap = plane_near(w.surfaces, w.motion, scene, a, slot // EXTREMES, 0).gap
+                touches = gap < w.motion.margin[scene, a]
             elif slot == 0:
-                touches = ball_near(s, poses, scene, a, b).gap < _margin(poses, scene, a, b)
-            found.row[scene, at] = wp.where(touches, 0, NONE)
+                touches = ball_near(w.surfaces, w.motion, scene, a, b).gap < _margin(w.motion, scene, a, b)
+            w.found.row[scene, at] = wp.where(touches, 0, NONE)
         for other in range(slot - slot % EXTREMES, slot):
-            if found.row[scene, pair * SLOTS + other] == found.row[scene, at]:
-                found.row[scene, at] = NONE
-        if found.row[scene, at] != NONE:
+            if w.found.row[scene, pair * SLOTS + other] == w.found.row[scene, at]:
+                w.found.row[scene, at] = NONE
+        if w.found.row[scene, at] != NONE:
             count += 1
-    found.count[scene, pair] = count
+    w.found.count[scene, pair] = count
 
 
 @wp.func
-def search(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, lane: int, lanes: int):
+def search(w: CollisionWorld, thread: GroupThread):
     """Find the contacts of all pairs: their slots and number, and the samples that are near."""
-    bodies = s.near.shape[0]
-    samples = s.near.shape[1]
+    scene = thread.scene
+    bodies = w.surfaces.near.shape[0]
+    samples = w.surfaces.near.shape[1]
     pairs = bodies * bodies
-    for pair in range(lane, pairs, lanes):
-        found.possible[scene, pair] = _possible(s, poses, scene, pair // bodies, pair % bodies)
-        found.count[scene, pair] = 0
+    for pair in range(thread.lane, pairs, thread.lanes):
+        w.found.possible[scene, pair] = _possible(w.surfaces, w.motion, scene, pair // bodies, pair % bodies)
+        w.found.count[scene, pair] = 0
     wait_for_group()
     for pair in range(pairs):
-        if found.possible[scene, pair]:
-            for q in range(lane, samples, lanes):
-                _look_at(s, poses, found, scene, pair, q)
+        if w.found.possible[scene, pair]:
+            for q in range(thread.lane, samples, thread.lanes):
+                _look_at(w, scene, pair, q)
     wait_for_group()
-    for pair in range(lane, pairs, lanes):
-        if found.possible[scene, pair]:
-            _list_near(s, poses, found, scene, pair)
+    for pair in range(thread.lane, pairs, thread.lanes):
+        if w.found.possible[scene, pair]:
+            _list_near(w, scene, pair)
     wait_for_group()
-    for row in range(lane, pairs * EXTREMES, lanes):
+    for row in range(thread.lane, pairs * EXTREMES, thread.lanes):
         pair = row // EXTREMES
-        if found.possible[scene, pair] and s.radius[pair // bodies] == 0.0:
-            _keep_extremes(s, poses, found, scene, pair, row % EXTREMES)
+        if w.found.possible[scene, pair] and w.surfaces.radius[pair // bodies] == 0.0:
+            _keep_extremes(w, scene, pair, row % EXTREMES)
     wait_for_group()
-    for pair in range(lane, pairs, lanes):
-        if found.possible[scene, pair]:
-            _count_contacts(s, poses, found, scene, pair)
+    for pair in range(thread.lane, pairs, thread.lanes):
+        if w.found.possible[scene, pair]:
+            _count_contacts(w, scene, pair)
     wait_for_group()
 
 
 @wp.func
-def contact_in_slot(s: SurfaceArrays, poses: BodyPoses, found: Found, scene: int, pair: int, slot: int) -> NearPoint:
+def contact_in_slot(w: CollisionWorld, scene: int, pair: int, slot: int) -> NearPoint:
     """The contact that `search` has put there."""
-    a = pair // s.near.shape[0]
-    b = pair % s.near.shape[0]
-    q = found.row[scene, pair * SLOTS + slot]
+    a = pair // w.surfaces.near.shape[0]
+    b = pair % w.surfaces.near.shape[0]
+    q = w.found.row[scene, pair * SLOTS + slot]
     if a == b:
-        return plane_near(s, poses, scene, a, slot // EXTREMES, q)
-    if s.radius[a] > 0.0:
-        return ball_near(s, poses, scene, a, b)
-    return sample_near(s, poses, scene, a, b, q)
+        return plane_near(w.surfaces, w.motion, scene, a, slot // EXTREMES, q)
+    if w.surfaces.radius[a] > 0.0:
+        return ball_near(w.surfaces, w.motion, scene, a, b)
+    return sample_near(w.surfaces, w.motion, scene, a, b, q)

@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 import warp as wp
 
-from stages.core.kernels.field.groups import wait_for_group
+from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.interop import empty_arrays
 from stages.core.kernels.splat.simd import by_device
 
@@ -37,9 +37,9 @@ ZERO, ONE, TINY = wp.constant(f64(0.0)), wp.constant(f64(1.0)), wp.constant(f64(
 
 # Sum over k = start .. end - 1 of H[i + k] H[j + k] inverse[k], of one scene
 _ROWS = r"""
-const double* a = H.data + (size_t)scene * H.shape[1] + i;
-const double* b = H.data + (size_t)scene * H.shape[1] + j;
-const double* d = inverse.data + (size_t)scene * inverse.shape[1];
+const double* a = d.H.data + (size_t)scene * d.H.shape[1] + i;
+const double* b = d.H.data + (size_t)scene * d.H.shape[1] + j;
+const double* inverse = d.inverse.data + (size_t)scene * d.inverse.shape[1];
 double sum = 0.0;
 int k = start;
 """
@@ -48,14 +48,14 @@ typedef double D __attribute__((ext_vector_type(4)));  // the compiler may not r
 auto load = [](const double* p) { D v; __builtin_memcpy(&v, p, sizeof(v)); return v; };
 D s = 0.0, t = 0.0;
 for (; k + 8 <= end; k += 8) {
-    s += load(a + k) * load(b + k) * load(d + k);
-    t += load(a + k + 4) * load(b + k + 4) * load(d + k + 4);
+    s += load(a + k) * load(b + k) * load(inverse + k);
+    t += load(a + k + 4) * load(b + k + 4) * load(inverse + k + 4);
 }
 s += t;
 sum = (s[0] + s[1]) + (s[2] + s[3]);
 """
 _SCALARS = r"""
-for (; k < end; ++k) sum += a[k] * b[k] * d[k];
+for (; k < end; ++k) sum += a[k] * b[k] * inverse[k];
 return sum;
 """
 
@@ -98,6 +98,14 @@ class Contacts:
 
 
 @wp.struct
+class Decomposition:
+    """The Hessian of each scene, replaced by its LDL' decomposition."""
+
+    H: wp.array2d[f64]  # lower triangle of the Hessian, and below it the negative gradient
+    inverse: wp.array2d[f64]  # of the diagonal of D
+
+
+@wp.struct
 class SolverMemory:
     """What the solver computes in between."""
 
@@ -110,8 +118,7 @@ class SolverMemory:
     pair_vectors: wp.array3d[wp.vec3d]
     step: Velocities
     before: Velocities
-    H: wp.array2d[f64]  # lower triangle of the Hessian, and below it the negative gradient
-    inverse: wp.array2d[f64]  # of the diagonal of its LDL' decomposition
+    decomposition: Decomposition
     order: wp.array2d[int]  # of the bodies in the Hessian, in which those that touch are near each other
     rank: wp.array2d[int]  # of each body in it
     first_rank: wp.array2d[int]  # least rank that the body of each rank is coupled to
@@ -119,30 +126,51 @@ class SolverMemory:
     partial: wp.array2d[f64]  # results of the threads
 
 
-def solver_arrays(device: str, scenes: int, bodies: int, contacts: int, group: int) -> tuple[Contacts, SolverMemory]:
-    """Room for `contacts` contacts in each scene, and for their solution by `group` threads for each scene."""
+@wp.struct
+class ContactSolver:
+    """The contacts of each scene, the bodies that they are between, and what their solution takes."""
+
+    contacts: Contacts
+    inertia: Inertias
+    velocities: Velocities  # near the solution at first, then those after the step; 0 of pinned bodies
+    free: Velocities  # those without contact; 0 of pinned bodies
+    memory: SolverMemory
+
+
+def contact_solver(device: str, scenes: int, bodies: int, contacts: int, group: int) -> ContactSolver:
+    """Room for `contacts` contacts in each scene, and for their solution by `group` threads for each scene.
+
+    Masses and what is pinned are to be filled in.
+    """
     b, pairs, n = scenes, bodies * bodies, 6 * bodies
-    found = empty_arrays(Contacts, device, (b, contacts), first=(b, pairs + 1), active=(b, pairs), active_count=(b,))
+    out = ContactSolver()
+    out.contacts = empty_arrays(
+        Contacts, device, (b, contacts), first=(b, pairs + 1), active=(b, pairs), active_count=(b,)
+    )  # fmt: skip
+    out.inertia = empty_arrays(Inertias, device, (b, bodies), mass=None, pinned=None)
     memory = empty_arrays(
         SolverMemory, device, (b, contacts), matrices=(b, contacts, 6), vectors=(b, contacts, 3),
-        pair_matrices=(b, pairs, 6), pair_vectors=(b, pairs, 3), step=None, before=None,
-        H=(b, n * (n + 1)), inverse=(b, n), order=(b, bodies), rank=(b, bodies), first_rank=(b, bodies),
-        last_rank=(b, bodies), partial=(b, group),
+        pair_matrices=(b, pairs, 6), pair_vectors=(b, pairs, 3), step=None, before=None, decomposition=None,
+        order=(b, bodies), rank=(b, bodies), first_rank=(b, bodies), last_rank=(b, bodies), partial=(b, group),
     )  # fmt: skip
-    memory.step, memory.before = (empty_arrays(Velocities, device, (b, bodies)) for _ in range(2))
-    return found, memory
+    memory.decomposition = empty_arrays(Decomposition, device, (b, n), H=(b, n * (n + 1)))
+    memory.step, memory.before, out.velocities, out.free = (
+        empty_arrays(Velocities, device, (b, bodies)) for _ in range(4)
+    )  # fmt: skip
+    out.memory = memory
+    return out
 
 
 def _over_group(combine: Callable) -> wp.Function:
-    """A function that gives all threads the values of the first `used` ones and 0, `combine`d in their order."""
+    """A function that gives all threads their values and 0, `combine`d in their order; at most `count` have any."""
 
     @wp.func
-    def over_group(memory: SolverMemory, scene: int, lane: int, used: int, value: f64) -> f64:
-        memory.partial[scene, lane] = value
+    def over_group(memory: SolverMemory, thread: GroupThread, count: int, value: f64) -> f64:
+        memory.partial[thread.scene, thread.lane] = value
         wait_for_group()
         out = f64(0.0)
-        for i in range(used):
-            out = combine(out, memory.partial[scene, i])
+        for i in range(wp.min(thread.lanes, count)):
+            out = combine(out, memory.partial[thread.scene, i])
         wait_for_group()
         return out
 
@@ -160,6 +188,11 @@ def effective_response(inertia: Inertias, scene: int, body: int, arm: wp.vec3d) 
     K = wp.skew(arm)
     turned = wp.transpose(K) * inertia.inverse[scene, body] * K
     return ONE / f64(inertia.mass[scene, body]) + (turned[0, 0] + turned[1, 1] + turned[2, 2]) / f64(3.0)
+
+
+@wp.func
+def _contact_count(c: Contacts, scene: int) -> int:
+    return c.first[scene, c.first.shape[1] - 1]
 
 
 @wp.func
@@ -204,40 +237,40 @@ def _hessian(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: f64) ->
 
 
 @wp.func
-def _evaluate(c: Contacts, memory: SolverMemory, v: Velocities, scene: int, i: int):
+def _evaluate(s: ContactSolver, scene: int, i: int):
     """The terms of a contact, with G its Hessian, J its impulse and K the cross products with its arms:
     G, K_a G, K_b G, K_a G K_a', K_a G K_b', K_b G K_b', and J, K_a J, K_b J.
     """
-    relative = _relative(c, v, scene, i)
-    G = _hessian(c, scene, i, relative, memory.bound[scene, i])
-    J = _impulse(c, scene, i, relative, memory.bound[scene, i])
-    K_a = wp.skew(c.arm_a[scene, i])
-    K_b = wp.skew(c.arm_b[scene, i])
-    memory.relative[scene, i] = relative
-    memory.matrices[scene, i, 0] = G
-    memory.matrices[scene, i, 1] = K_a * G
-    memory.matrices[scene, i, 2] = K_b * G
-    memory.matrices[scene, i, 3] = K_a * G * wp.transpose(K_a)
-    memory.matrices[scene, i, 4] = K_a * G * wp.transpose(K_b)
-    memory.matrices[scene, i, 5] = K_b * G * wp.transpose(K_b)
-    memory.vectors[scene, i, 0] = J
-    memory.vectors[scene, i, 1] = K_a * J
-    memory.vectors[scene, i, 2] = K_b * J
+    relative = _relative(s.contacts, s.velocities, scene, i)
+    G = _hessian(s.contacts, scene, i, relative, s.memory.bound[scene, i])
+    J = _impulse(s.contacts, scene, i, relative, s.memory.bound[scene, i])
+    K_a = wp.skew(s.contacts.arm_a[scene, i])
+    K_b = wp.skew(s.contacts.arm_b[scene, i])
+    s.memory.relative[scene, i] = relative
+    s.memory.matrices[scene, i, 0] = G
+    s.memory.matrices[scene, i, 1] = K_a * G
+    s.memory.matrices[scene, i, 2] = K_b * G
+    s.memory.matrices[scene, i, 3] = K_a * G * wp.transpose(K_a)
+    s.memory.matrices[scene, i, 4] = K_a * G * wp.transpose(K_b)
+    s.memory.matrices[scene, i, 5] = K_b * G * wp.transpose(K_b)
+    s.memory.vectors[scene, i, 0] = J
+    s.memory.vectors[scene, i, 1] = K_a * J
+    s.memory.vectors[scene, i, 2] = K_b * J
 
 
 @wp.func
-def _sum_pair(c: Contacts, memory: SolverMemory, scene: int, pair: int, term: int):
+def _sum_pair(s: ContactSolver, scene: int, pair: int, term: int):
     """The sum of one of the matrices, or of the vectors after them, over the contacts of a pair."""
     if term < 6:
         matrix = wp.mat33d()
-        for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
-            matrix += memory.matrices[scene, i, term]
-        memory.pair_matrices[scene, pair, term] = matrix
+        for i in range(s.contacts.first[scene, pair], s.contacts.first[scene, pair + 1]):
+            matrix += s.memory.matrices[scene, i, term]
+        s.memory.pair_matrices[scene, pair, term] = matrix
     else:
         vector = wp.vec3d()
-        for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
-            vector += memory.vectors[scene, i, term - 6]
-        memory.pair_vectors[scene, pair, term - 6] = vector
+        for i in range(s.contacts.first[scene, pair], s.contacts.first[scene, pair + 1]):
+            vector += s.memory.vectors[scene, i, term - 6]
+        s.memory.pair_vectors[scene, pair, term - 6] = vector
 
 
 @wp.func
@@ -245,98 +278,103 @@ def _has_contacts(c: Contacts, scene: int, pair: int) -> bool:
     return c.first[scene, pair + 1] > c.first[scene, pair]
 
 
+@wp.struct
+class HessianBlock:
+    """The rows of one body and the columns of another one, or of the same."""
+
+    top: wp.mat33d  # of velocities
+    right: wp.mat33d
+    left: wp.mat33d
+    bottom: wp.mat33d  # of spins
+
+
 @wp.func
-def _write_block(
-    memory: SolverMemory, scene: int, i: int, j: int, bodies: int, top: wp.mat33d, right: wp.mat33d, left: wp.mat33d,
-    bottom: wp.mat33d,
-):  # fmt: skip
-    """Write the block of ranks i and j to the Hessian; `top` acts on velocities, `bottom` on spins."""
-    n = 6 * bodies
+def _write_block(memory: SolverMemory, scene: int, i: int, j: int, block: HessianBlock):
+    """Write the block of ranks i and j to the Hessian."""
+    n = 6 * memory.rank.shape[1]
     for r in range(3):
         for k in range(3):
-            memory.H[scene, (6 * i + r) * n + 6 * j + k] = top[r, k]
-            memory.H[scene, (6 * i + r) * n + 6 * j + 3 + k] = right[r, k]
-            memory.H[scene, (6 * i + 3 + r) * n + 6 * j + k] = left[r, k]
-            memory.H[scene, (6 * i + 3 + r) * n + 6 * j + 3 + k] = bottom[r, k]
+            memory.decomposition.H[scene, (6 * i + r) * n + 6 * j + k] = block.top[r, k]
+            memory.decomposition.H[scene, (6 * i + r) * n + 6 * j + 3 + k] = block.right[r, k]
+            memory.decomposition.H[scene, (6 * i + 3 + r) * n + 6 * j + k] = block.left[r, k]
+            memory.decomposition.H[scene, (6 * i + 3 + r) * n + 6 * j + 3 + k] = block.bottom[r, k]
 
 
 @wp.func
-def _assemble_own(
-    c: Contacts, inertia: Inertias, memory: SolverMemory, v: Velocities, free: Velocities, scene: int, i: int,
-    bodies: int,
-):  # fmt: skip
+def _assemble_own(s: ContactSolver, scene: int, i: int):
     """The block of body i with itself, and its negative gradient."""
+    bodies = s.memory.rank.shape[1]
     n = 6 * bodies
     eye = wp.identity(3, dtype=f64)
-    top = eye
-    left = wp.mat33d()
-    bottom = eye
+    block = HessianBlock()
+    block.top = eye
+    block.bottom = eye
     force = wp.vec3d()
     torque = wp.vec3d()
-    if not inertia.pinned[scene, i]:
-        mass = f64(inertia.mass[scene, i])
-        top = mass * eye
-        bottom = inertia.tensor[scene, i]
-        force = -mass * (v.linear[scene, i] - free.linear[scene, i])
-        torque = -(bottom * (v.angular[scene, i] - free.angular[scene, i]))
+    if not s.inertia.pinned[scene, i]:
+        mass = f64(s.inertia.mass[scene, i])
+        block.top = mass * eye
+        block.bottom = s.inertia.tensor[scene, i]
+        force = -mass * (s.velocities.linear[scene, i] - s.free.linear[scene, i])
+        torque = -(block.bottom * (s.velocities.angular[scene, i] - s.free.angular[scene, i]))
         for other in range(bodies):
             pair = i * bodies + other
-            if _has_contacts(c, scene, pair):
-                top += memory.pair_matrices[scene, pair, 0]
-                left += memory.pair_matrices[scene, pair, 1]
-                bottom += memory.pair_matrices[scene, pair, 3]
-                force += memory.pair_vectors[scene, pair, 0]
-                torque += memory.pair_vectors[scene, pair, 1]
+            if _has_contacts(s.contacts, scene, pair):
+                block.top += s.memory.pair_matrices[scene, pair, 0]
+                block.left += s.memory.pair_matrices[scene, pair, 1]
+                block.bottom += s.memory.pair_matrices[scene, pair, 3]
+                force += s.memory.pair_vectors[scene, pair, 0]
+                torque += s.memory.pair_vectors[scene, pair, 1]
             pair = other * bodies + i
-            if other != i and _has_contacts(c, scene, pair):
-                top += memory.pair_matrices[scene, pair, 0]
-                left += memory.pair_matrices[scene, pair, 2]
-                bottom += memory.pair_matrices[scene, pair, 5]
-                force -= memory.pair_vectors[scene, pair, 0]
-                torque -= memory.pair_vectors[scene, pair, 2]
-    row = memory.rank[scene, i]
-    _write_block(memory, scene, row, row, bodies, top, wp.transpose(left), left, bottom)
+            if other != i and _has_contacts(s.contacts, scene, pair):
+                block.top += s.memory.pair_matrices[scene, pair, 0]
+                block.left += s.memory.pair_matrices[scene, pair, 2]
+                block.bottom += s.memory.pair_matrices[scene, pair, 5]
+                force -= s.memory.pair_vectors[scene, pair, 0]
+                torque -= s.memory.pair_vectors[scene, pair, 2]
+    block.right = wp.transpose(block.left)
+    row = s.memory.rank[scene, i]
+    _write_block(s.memory, scene, row, row, block)
     for k in range(3):
-        memory.H[scene, n * n + 6 * row + k] = force[k]
-        memory.H[scene, n * n + 6 * row + 3 + k] = torque[k]
+        s.memory.decomposition.H[scene, n * n + 6 * row + k] = force[k]
+        s.memory.decomposition.H[scene, n * n + 6 * row + 3 + k] = torque[k]
 
 
 @wp.func
-def _assemble_pair(c: Contacts, inertia: Inertias, memory: SolverMemory, scene: int, i: int, j: int, bodies: int):
+def _assemble_pair(s: ContactSolver, scene: int, i: int, j: int):
     """The block of body i with a body j of lower rank."""
-    top = wp.mat33d()
-    right = wp.mat33d()
-    left = wp.mat33d()
-    bottom = wp.mat33d()
-    if not (inertia.pinned[scene, i] or inertia.pinned[scene, j]):
+    bodies = s.memory.rank.shape[1]
+    block = HessianBlock()
+    if not (s.inertia.pinned[scene, i] or s.inertia.pinned[scene, j]):
         pair = i * bodies + j
-        if _has_contacts(c, scene, pair):
-            top -= memory.pair_matrices[scene, pair, 0]
-            right -= wp.transpose(memory.pair_matrices[scene, pair, 2])
-            left -= memory.pair_matrices[scene, pair, 1]
-            bottom -= memory.pair_matrices[scene, pair, 4]
+        if _has_contacts(s.contacts, scene, pair):
+            block.top -= s.memory.pair_matrices[scene, pair, 0]
+            block.right -= wp.transpose(s.memory.pair_matrices[scene, pair, 2])
+            block.left -= s.memory.pair_matrices[scene, pair, 1]
+            block.bottom -= s.memory.pair_matrices[scene, pair, 4]
         pair = j * bodies + i
-        if _has_contacts(c, scene, pair):
-            top -= memory.pair_matrices[scene, pair, 0]
-            right -= wp.transpose(memory.pair_matrices[scene, pair, 1])
-            left -= memory.pair_matrices[scene, pair, 2]
-            bottom -= wp.transpose(memory.pair_matrices[scene, pair, 4])
-    _write_block(memory, scene, memory.rank[scene, i], memory.rank[scene, j], bodies, top, right, left, bottom)
+        if _has_contacts(s.contacts, scene, pair):
+            block.top -= s.memory.pair_matrices[scene, pair, 0]
+            block.right -= wp.transpose(s.memory.pair_matrices[scene, pair, 1])
+            block.left -= s.memory.pair_matrices[scene, pair, 2]
+            block.bottom -= wp.transpose(s.memory.pair_matrices[scene, pair, 4])
+    _write_block(s.memory, scene, s.memory.rank[scene, i], s.memory.rank[scene, j], block)
 
 
 @wp.func_native(_ROWS + by_device("", _VECTORS) + _SCALARS)
-def _weighted_product(H: wp.array2d[f64], inverse: wp.array2d[f64], scene: int, i: int, j: int, start: int, end: int
-                      ) -> f64: ...  # fmt: skip
+def _weighted_product(d: Decomposition, scene: int, i: int, j: int, start: int, end: int) -> f64: ...
 
 
 @wp.func
-def _factorise(memory: SolverMemory, scene: int, lane: int, lanes: int, bodies: int):
+def _factorise(memory: SolverMemory, thread: GroupThread):
     """LDL' of the Hessian in place, each row from the first rank it is coupled to; the last row is solved with L."""
-    n = 6 * bodies
+    d = memory.decomposition
+    scene = thread.scene
+    n = 6 * memory.rank.shape[1]
     for j in range(n):
         start_j = 6 * memory.first_rank[scene, j // 6]
         end = 6 * memory.last_rank[scene, j // 6] + 6
-        for row in range(j + lane, end + 1, lanes):
+        for row in range(j + thread.lane, end + 1, thread.lanes):
             i = row
             start = start_j
             if row < end:
@@ -344,76 +382,76 @@ def _factorise(memory: SolverMemory, scene: int, lane: int, lanes: int, bodies: 
             else:
                 i = n
             if start <= j:
-                s = memory.H[scene, i * n + j] - _weighted_product(
-                    memory.H, memory.inverse, scene, i * n, j * n, start, j
-                )  # fmt: skip
-                memory.H[scene, i * n + j] = s
+                s = d.H[scene, i * n + j]
+                s -= _weighted_product(d, scene, i * n, j * n, start, j)
+                d.H[scene, i * n + j] = s
                 if i == j:
-                    memory.inverse[scene, j] = ONE / s
+                    d.inverse[scene, j] = ONE / s
         wait_for_group()
 
 
 @wp.func
-def _back_substitute(memory: SolverMemory, scene: int, lane: int, lanes: int, bodies: int):
+def _back_substitute(memory: SolverMemory, thread: GroupThread):
     """The step of Newton's method from the decomposition."""
+    d = memory.decomposition
+    scene = thread.scene
+    bodies = memory.rank.shape[1]
     n = 6 * bodies
     for back in range(n):
         j = n - 1 - back
-        x = memory.H[scene, n * n + j] * memory.inverse[scene, j]
-        for i in range(6 * memory.first_rank[scene, j // 6] + lane, j, lanes):
-            memory.H[scene, n * n + i] = memory.H[scene, n * n + i] - memory.H[scene, j * n + i] * x
+        x = d.H[scene, n * n + j] * d.inverse[scene, j]
+        for i in range(6 * memory.first_rank[scene, j // 6] + thread.lane, j, thread.lanes):
+            d.H[scene, n * n + i] = d.H[scene, n * n + i] - d.H[scene, j * n + i] * x
         wait_for_group()
-    for i in range(lane, bodies, lanes):
+    for i in range(thread.lane, bodies, thread.lanes):
         linear = wp.vec3d()
         angular = wp.vec3d()
         row = 6 * memory.rank[scene, i]
         for k in range(3):
-            linear[k] = memory.H[scene, n * n + row + k] * memory.inverse[scene, row + k]
-            angular[k] = memory.H[scene, n * n + row + 3 + k] * memory.inverse[scene, row + 3 + k]
+            linear[k] = d.H[scene, n * n + row + k] * d.inverse[scene, row + k]
+            angular[k] = d.H[scene, n * n + row + 3 + k] * d.inverse[scene, row + 3 + k]
         memory.step.linear[scene, i] = linear
         memory.step.angular[scene, i] = angular
     wait_for_group()
 
 
 @wp.func
-def _slope(
-    c: Contacts, memory: SolverMemory, scene: int, lane: int, lanes: int, count: int, size: f64, inertial: f64
-) -> f64:
+def _slope(s: ContactSolver, thread: GroupThread, size: f64, inertial: f64) -> f64:
     """Derivative of the function along the step, at this size of it; `inertial` is the part of the inertia."""
-    s = f64(0.0)
-    for i in range(lane, count, lanes):
-        along = memory.along[scene, i]
-        impulse = _impulse(c, scene, i, memory.relative[scene, i] + size * along, memory.bound[scene, i])
-        s -= wp.dot(impulse, along)
-    return inertial + _total(memory, scene, lane, wp.min(lanes, count), s)
+    scene = thread.scene
+    count = _contact_count(s.contacts, scene)
+    slope = f64(0.0)
+    for i in range(thread.lane, count, thread.lanes):
+        along = s.memory.along[scene, i]
+        relative = s.memory.relative[scene, i] + size * along
+        slope -= wp.dot(_impulse(s.contacts, scene, i, relative, s.memory.bound[scene, i]), along)
+    return inertial + _total(s.memory, thread, count, slope)
 
 
 @wp.func
-def _step_size(
-    c: Contacts, inertia: Inertias, memory: SolverMemory, v: Velocities, free: Velocities, scene: int, lane: int,
-    lanes: int, bodies: int,
-) -> f64:  # fmt: skip
+def _step_size(s: ContactSolver, thread: GroupThread) -> f64:
     """Where the derivative along the step vanishes, at most 1."""
-    count = c.first[scene, bodies * bodies]
-    for i in range(lane, count, lanes):
-        memory.along[scene, i] = _relative(c, memory.step, scene, i)
+    scene = thread.scene
+    bodies = s.memory.rank.shape[1]
+    for i in range(thread.lane, _contact_count(s.contacts, scene), thread.lanes):
+        s.memory.along[scene, i] = _relative(s.contacts, s.memory.step, scene, i)
     at_zero = f64(0.0)
     gain = f64(0.0)
-    for i in range(lane, bodies, lanes):
-        if not inertia.pinned[scene, i]:
-            linear = memory.step.linear[scene, i]
-            angular = memory.step.angular[scene, i]
-            mass = f64(inertia.mass[scene, i])
-            pushed = inertia.tensor[scene, i] * angular
-            at_zero += mass * wp.dot(v.linear[scene, i] - free.linear[scene, i], linear)
-            at_zero += wp.dot(v.angular[scene, i] - free.angular[scene, i], pushed)
+    for i in range(thread.lane, bodies, thread.lanes):
+        if not s.inertia.pinned[scene, i]:
+            linear = s.memory.step.linear[scene, i]
+            angular = s.memory.step.angular[scene, i]
+            mass = f64(s.inertia.mass[scene, i])
+            pushed = s.inertia.tensor[scene, i] * angular
+            at_zero += mass * wp.dot(s.velocities.linear[scene, i] - s.free.linear[scene, i], linear)
+            at_zero += wp.dot(s.velocities.angular[scene, i] - s.free.angular[scene, i], pushed)
             gain += mass * wp.dot(linear, linear) + wp.dot(angular, pushed)
-    at_zero = _total(memory, scene, lane, wp.min(lanes, bodies), at_zero)
-    gain = _total(memory, scene, lane, wp.min(lanes, bodies), gain)
+    at_zero = _total(s.memory, thread, bodies, at_zero)
+    gain = _total(s.memory, thread, bodies, gain)
     low = f64(0.0)
-    slope_low = _slope(c, memory, scene, lane, lanes, count, low, at_zero)
+    slope_low = _slope(s, thread, low, at_zero)
     high = f64(1.0)
-    slope_high = _slope(c, memory, scene, lane, lanes, count, high, at_zero + gain)
+    slope_high = _slope(s, thread, high, at_zero + gain)
     if slope_high <= ZERO or slope_low >= ZERO:  # the latter by rounding, at the minimum
         return high
     size = high
@@ -421,7 +459,7 @@ def _step_size(
     limit = wp.abs(slope_low) * SEARCH_TOLERANCE
     for _ in range(SEARCHES):  # false position, with the end that stays counting half (Dowell and Jarratt 1971)
         size = low + (high - low) * slope_low / (slope_low - slope_high)
-        slope = _slope(c, memory, scene, lane, lanes, count, size, at_zero + size * gain)
+        slope = _slope(s, thread, size, at_zero + size * gain)
         if wp.abs(slope) < limit:
             break
         if slope > ZERO:
@@ -440,107 +478,107 @@ def _step_size(
 
 
 @wp.func
-def _newton_step(
-    c: Contacts, inertia: Inertias, memory: SolverMemory, v: Velocities, free: Velocities, scene: int, lane: int,
-    lanes: int, bodies: int,
-) -> f64:  # fmt: skip
+def _newton_step(s: ContactSolver, thread: GroupThread) -> f64:
     """Change the velocities by a step of Newton's method; the largest change."""
-    for i in range(lane, c.first[scene, bodies * bodies], lanes):
-        _evaluate(c, memory, v, scene, i)
+    scene = thread.scene
+    bodies = s.memory.rank.shape[1]
+    for i in range(thread.lane, _contact_count(s.contacts, scene), thread.lanes):
+        _evaluate(s, scene, i)
     wait_for_group()
-    for k in range(lane, 9 * c.active_count[scene], lanes):
-        _sum_pair(c, memory, scene, c.active[scene, k // 9], k % 9)
+    for k in range(thread.lane, 9 * s.contacts.active_count[scene], thread.lanes):
+        _sum_pair(s, scene, s.contacts.active[scene, k // 9], k % 9)
     wait_for_group()
-    for i in range(lane, bodies, lanes):
-        _assemble_own(c, inertia, memory, v, free, scene, i, bodies)
-    for i in range(lane, bodies, lanes):  # ranks
-        for j in range(memory.first_rank[scene, i], i):
-            _assemble_pair(c, inertia, memory, scene, memory.order[scene, i], memory.order[scene, j], bodies)
+    for i in range(thread.lane, bodies, thread.lanes):
+        _assemble_own(s, scene, i)
+    for i in range(thread.lane, bodies, thread.lanes):  # ranks
+        for j in range(s.memory.first_rank[scene, i], i):
+            _assemble_pair(s, scene, s.memory.order[scene, i], s.memory.order[scene, j])
     wait_for_group()
-    _factorise(memory, scene, lane, lanes, bodies)
-    _back_substitute(memory, scene, lane, lanes, bodies)
-    size = _step_size(c, inertia, memory, v, free, scene, lane, lanes, bodies)
+    _factorise(s.memory, thread)
+    _back_substitute(s.memory, thread)
+    size = _step_size(s, thread)
     change = f64(0.0)
-    for i in range(lane, bodies, lanes):
-        linear = size * memory.step.linear[scene, i]
-        angular = size * memory.step.angular[scene, i]
-        v.linear[scene, i] = v.linear[scene, i] + linear
-        v.angular[scene, i] = v.angular[scene, i] + angular
+    for i in range(thread.lane, bodies, thread.lanes):
+        linear = size * s.memory.step.linear[scene, i]
+        angular = size * s.memory.step.angular[scene, i]
+        s.velocities.linear[scene, i] = s.velocities.linear[scene, i] + linear
+        s.velocities.angular[scene, i] = s.velocities.angular[scene, i] + angular
         for k in range(3):
             change = wp.max(change, wp.max(wp.abs(linear[k]), wp.abs(angular[k])))
-    return _largest(memory, scene, lane, wp.min(lanes, bodies), change)
+    return _largest(s.memory, thread, bodies, change)
 
 
 @wp.func
-def _coupled(c: Contacts, inertia: Inertias, scene: int, i: int, j: int, bodies: int) -> bool:
-    free = not (inertia.pinned[scene, i] or inertia.pinned[scene, j])
-    return free and (_has_contacts(c, scene, i * bodies + j) or _has_contacts(c, scene, j * bodies + i))
+def _coupled(s: ContactSolver, scene: int, i: int, j: int) -> bool:
+    bodies = s.memory.rank.shape[1]
+    free = not (s.inertia.pinned[scene, i] or s.inertia.pinned[scene, j])
+    touching = _has_contacts(s.contacts, scene, i * bodies + j) or _has_contacts(s.contacts, scene, j * bodies + i)
+    return free and touching
 
 
 @wp.func
-def _sort_bodies(c: Contacts, inertia: Inertias, memory: SolverMemory, scene: int, bodies: int):
+def _sort_bodies(s: ContactSolver, scene: int):
     """Order the bodies by breadth-first search, island by island (Cuthill and McKee 1969): the Hessian is then zero
     outside a band.
     """
+    bodies = s.memory.rank.shape[1]
     for i in range(bodies):
-        memory.rank[scene, i] = -1
+        s.memory.rank[scene, i] = -1
     end = int(0)
     for i in range(bodies):
-        if memory.rank[scene, i] < 0:
-            memory.rank[scene, i] = end
-            memory.order[scene, end] = i
+        if s.memory.rank[scene, i] < 0:
+            s.memory.rank[scene, i] = end
+            s.memory.order[scene, end] = i
             at = int(end)
             end += 1
             while at < end:
-                body = memory.order[scene, at]
+                body = s.memory.order[scene, at]
                 least = int(at)
                 for j in range(bodies):
-                    if j != body and _coupled(c, inertia, scene, body, j, bodies):
-                        if memory.rank[scene, j] < 0:
-                            memory.rank[scene, j] = end
-                            memory.order[scene, end] = j
+                    if j != body and _coupled(s, scene, body, j):
+                        if s.memory.rank[scene, j] < 0:
+                            s.memory.rank[scene, j] = end
+                            s.memory.order[scene, end] = j
                             end += 1
-                        least = wp.min(least, memory.rank[scene, j])
-                memory.first_rank[scene, at] = least
+                        least = wp.min(least, s.memory.rank[scene, j])
+                s.memory.first_rank[scene, at] = least
                 for rank in range(least, at + 1):
-                    memory.last_rank[scene, rank] = at
+                    s.memory.last_rank[scene, rank] = at
                 at += 1
 
 
 @wp.func
-def solve(
-    c: Contacts, inertia: Inertias, memory: SolverMemory, v: Velocities, free: Velocities, scene: int, lane: int,
-    lanes: int, bodies: int,
-):  # fmt: skip
-    """Change velocities `v`, which are near the solution at first, to those after the step, and set the impulses.
-
-    `free` are those without contact; of pinned bodies both are 0.
-    """
-    if lane == 0:
-        _sort_bodies(c, inertia, memory, scene, bodies)
-    count = c.first[scene, bodies * bodies]
-    for i in range(lane, count, lanes):
-        memory.bound[scene, i] = ZERO
+def solve(s: ContactSolver, thread: GroupThread):
+    """Change the velocities to those after the step, and set the impulses of the contacts."""
+    scene = thread.scene
+    bodies = s.memory.rank.shape[1]
+    if thread.lane == 0:
+        _sort_bodies(s, scene)
+    count = _contact_count(s.contacts, scene)
+    for i in range(thread.lane, count, thread.lanes):
+        s.memory.bound[scene, i] = ZERO
     wait_for_group()
     for k in range(ROUNDS):  # the first without friction
         if k > 0:
-            for i in range(lane, count, lanes):
-                memory.bound[scene, i] = c.friction[scene, i] * _along(c, scene, i, _relative(c, v, scene, i))
-        for i in range(lane, bodies, lanes):
-            memory.before.linear[scene, i] = v.linear[scene, i]
-            memory.before.angular[scene, i] = v.angular[scene, i]
+            for i in range(thread.lane, count, thread.lanes):
+                along = _along(s.contacts, scene, i, _relative(s.contacts, s.velocities, scene, i))
+                s.memory.bound[scene, i] = s.contacts.friction[scene, i] * along
+        for i in range(thread.lane, bodies, thread.lanes):
+            s.memory.before.linear[scene, i] = s.velocities.linear[scene, i]
+            s.memory.before.angular[scene, i] = s.velocities.angular[scene, i]
         wait_for_group()
         for _ in range(ITERATIONS):
-            if _newton_step(c, inertia, memory, v, free, scene, lane, lanes, bodies) < TOLERANCE:
+            if _newton_step(s, thread) < TOLERANCE:
                 break
         change = f64(0.0)
-        for i in range(lane, bodies, lanes):
-            linear = v.linear[scene, i] - memory.before.linear[scene, i]
-            angular = v.angular[scene, i] - memory.before.angular[scene, i]
+        for i in range(thread.lane, bodies, thread.lanes):
+            linear = s.velocities.linear[scene, i] - s.memory.before.linear[scene, i]
+            angular = s.velocities.angular[scene, i] - s.memory.before.angular[scene, i]
             for axis in range(3):
                 change = wp.max(change, wp.max(wp.abs(linear[axis]), wp.abs(angular[axis])))
-        if _largest(memory, scene, lane, wp.min(lanes, bodies), change) < TOLERANCE and k > 0:
+        if _largest(s.memory, thread, bodies, change) < TOLERANCE and k > 0:
             break
-    for i in range(lane, count, lanes):
-        c.impulse[scene, i] = _impulse(c, scene, i, _relative(c, v, scene, i), memory.bound[scene, i])
+    for i in range(thread.lane, count, thread.lanes):
+        relative = _relative(s.contacts, s.velocities, scene, i)
+        s.contacts.impulse[scene, i] = _impulse(s.contacts, scene, i, relative, s.memory.bound[scene, i])
     wait_for_group()

@@ -16,8 +16,10 @@ from stages.core.kernels.field.contact_search import (
     MARGIN,
     NONE,
     SLOTS,
-    BodyPoses,
+    BodyMotion,
+    CollisionWorld,
     Found,
+    NearPoint,
     SurfaceArrays,
     contact_in_slot,
     search,
@@ -26,14 +28,13 @@ from stages.core.kernels.field.contact_solve import (
     FRICTION_REGULARISATION,
     NORMAL_REGULARISATION,
     Contacts,
-    Inertias,
-    SolverMemory,
+    ContactSolver,
     Velocities,
+    contact_solver,
     effective_response,
     solve,
-    solver_arrays,
 )
-from stages.core.kernels.field.groups import wait_for_group
+from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
 from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays
 
@@ -60,17 +61,6 @@ class BodyProperties:
     acceleration: wp.array2d[wp.vec3]  # without contact, of the centres of mass [m/s^2]
     twist: wp.array2d[wp.vec3]  # torque per unit of mass [m^2/s^2]
     mass_fraction: wp.array3d[float]  # of keypoints
-
-
-@wp.struct
-class BodyMotion:
-    """State of the bodies of each scene."""
-
-    com: wp.array2d[wp.vec3]
-    quat: wp.array2d[wp.vec4]
-    velocity: wp.array2d[wp.vec3]
-    momentum: wp.array2d[wp.vec3]  # angular, per unit of mass
-    spin: wp.array2d[wp.vec3]
 
 
 @wp.struct
@@ -120,57 +110,54 @@ def _drifted(m: BodyMotion, bodies: BodyProperties, scene: int, i: int, h: float
 
 
 @wp.func
-def _begin(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, inertia: Inertias, v: Velocities,
-    free: Velocities, scene: int, i: int, h: float,
-):  # fmt: skip
+def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver, scene: int, i: int):
     """The first half of a substep for body i, and its velocities without contact."""
-    _drifted(m, bodies, scene, i, h / 2.0)
-    R = matrix(m.quat[scene, i])
+    h = world.motion.step
+    _drifted(world.motion, bodies, scene, i, h / 2.0)
+    R = matrix(world.motion.quat[scene, i])
     inverse = bodies.inverse[scene, i]
     mass = f64(bodies.mass[scene, i])
-    spin = spin_of(m.momentum[scene, i], inverse, R)
-    later = spin_of(m.momentum[scene, i] + h * bodies.twist[scene, i], inverse, R)
-    m.spin[scene, i] = spin
-    poses.R[scene, i] = R
-    poses.margin[scene, i] = MARGIN + h * (wp.length(m.velocity[scene, i]) + wp.length(spin) * s.reach[i])
+    velocity = world.motion.velocity[scene, i]
+    momentum = world.motion.momentum[scene, i]
+    spin = spin_of(momentum, inverse, R)
+    later = spin_of(momentum + h * bodies.twist[scene, i], inverse, R)
+    world.motion.spin[scene, i] = spin
+    world.motion.R[scene, i] = R
+    world.motion.margin[scene, i] = MARGIN + h * (wp.length(velocity) + wp.length(spin) * world.surfaces.reach[i])
     turn = _double_matrix(R)
-    inertia.tensor[scene, i] = mass * (turn * _double_matrix(bodies.inertia[scene, i]) * wp.transpose(turn))
-    inertia.inverse[scene, i] = turn * _double_matrix(inverse) * wp.transpose(turn) / mass
-    v.linear[scene, i] = _double(m.velocity[scene, i])
-    v.angular[scene, i] = _double(spin)
-    free.linear[scene, i] = wp.vec3d()
-    free.angular[scene, i] = wp.vec3d()
-    if not poses.pinned[scene, i]:
-        free.linear[scene, i] = _double(m.velocity[scene, i] + h * bodies.acceleration[scene, i])
-        free.angular[scene, i] = _double(later)
+    solver.inertia.tensor[scene, i] = mass * (turn * _double_matrix(bodies.inertia[scene, i]) * wp.transpose(turn))
+    solver.inertia.inverse[scene, i] = turn * _double_matrix(inverse) * wp.transpose(turn) / mass
+    solver.velocities.linear[scene, i] = _double(velocity)
+    solver.velocities.angular[scene, i] = _double(spin)
+    solver.free.linear[scene, i] = wp.vec3d()
+    solver.free.angular[scene, i] = wp.vec3d()
+    if not world.motion.pinned[scene, i]:
+        solver.free.linear[scene, i] = _double(velocity + h * bodies.acceleration[scene, i])
+        solver.free.angular[scene, i] = _double(later)
 
 
 @wp.func
-def _add_contact(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias,
-    c: Contacts, scene: int, pair: int, slot: int, i: int, h: float,
-):  # fmt: skip
-    """Write the contact of a slot as contact i."""
-    a = pair // s.samples.shape[0]
-    b = pair % s.samples.shape[0]
-    near = contact_in_slot(s, poses, found, scene, pair, slot)
+def _add_contact(bodies: BodyProperties, m: BodyMotion, solver: ContactSolver, near: NearPoint, scene: int, i: int):
+    """Write the contact at a point as contact i."""
+    h = m.step
+    a = near.a
+    b = near.b
     at = near.at
     if b != a:
         at = near.at - near.gap / 2.0 * near.normal
-    arm_a = at - poses.com[scene, a]
-    arm_b = at - poses.com[scene, b]
+    arm_a = at - m.com[scene, a]
+    arm_b = at - m.com[scene, b]
     speed = m.velocity[scene, a] + wp.cross(m.spin[scene, a], arm_a)
     pull = bodies.acceleration[scene, a]
     loss = bodies.loss[scene, a]
     friction = bodies.friction[scene, a]
-    response = effective_response(inertia, scene, a, _double(arm_a))
+    response = effective_response(solver.inertia, scene, a, _double(arm_a))
     if b != a:
         speed -= m.velocity[scene, b] + wp.cross(m.spin[scene, b], arm_b)
         pull -= bodies.acceleration[scene, b]
         loss = wp.max(loss, bodies.loss[scene, b])
         friction = wp.max(friction, bodies.friction[scene, b])
-        response += effective_response(inertia, scene, b, _double(arm_b))
+        response += effective_response(solver.inertia, scene, b, _double(arm_b))
     approach = wp.dot(speed, near.normal)
     gained = h / 2.0 * wp.dot(pull, near.normal)  # until the middle of the step, and again after it
     target = -near.gap / h
@@ -178,34 +165,34 @@ def _add_contact(
         target = wp.min(-RECOVERY / h * near.gap, MAX_RECOVERY_SPEED)
     if approach < -REBOUND_SPEED and near.gap + h * approach < ROUGHNESS:
         target = wp.max(target, gained - wp.exp(-HALF_PI * loss) * (approach + gained))
-    c.a[scene, i] = a
-    c.b[scene, i] = b
-    c.normal[scene, i] = _double(near.normal)
-    c.arm_a[scene, i] = _double(arm_a)
-    c.arm_b[scene, i] = _double(arm_b)
-    c.target[scene, i] = f64(target)
-    c.friction[scene, i] = f64(friction)
-    c.R_n[scene, i] = NORMAL_REGULARISATION * response
-    c.R_t[scene, i] = FRICTION_REGULARISATION * response
+    solver.contacts.a[scene, i] = a
+    solver.contacts.b[scene, i] = b
+    solver.contacts.normal[scene, i] = _double(near.normal)
+    solver.contacts.arm_a[scene, i] = _double(arm_a)
+    solver.contacts.arm_b[scene, i] = _double(arm_b)
+    solver.contacts.target[scene, i] = f64(target)
+    solver.contacts.friction[scene, i] = f64(friction)
+    solver.contacts.R_n[scene, i] = NORMAL_REGULARISATION * response
+    solver.contacts.R_t[scene, i] = FRICTION_REGULARISATION * response
 
 
 @wp.func
-def _end(bodies: BodyProperties, m: BodyMotion, poses: BodyPoses, v: Velocities, scene: int, i: int, h: float):
+def _end(bodies: BodyProperties, m: BodyMotion, v: Velocities, scene: int, i: int):
     """The second half of a substep."""
     velocity = _single(v.linear[scene, i])
-    R = poses.R[scene, i]
+    R = m.R[scene, i]
     momentum = R * (bodies.inertia[scene, i] * (wp.transpose(R) * _single(v.angular[scene, i])))
-    if poses.pinned[scene, i]:
+    if m.pinned[scene, i]:
         velocity = wp.vec3()
         momentum = wp.vec3()
     m.velocity[scene, i] = velocity
     m.momentum[scene, i] = momentum
-    _drifted(m, bodies, scene, i, h / 2.0)
+    _drifted(m, bodies, scene, i, m.step / 2.0)
 
 
 @wp.func
-def _place(s: SurfaceArrays, poses: BodyPoses, scene: int, a: int, q: int) -> wp.vec3:
-    return poses.com[scene, a] + poses.R[scene, a] * s.samples[a, q]
+def _place(w: CollisionWorld, scene: int, a: int, q: int) -> wp.vec3:
+    return w.motion.com[scene, a] + w.motion.R[scene, a] * w.surfaces.samples[a, q]
 
 
 @wp.func
@@ -217,30 +204,30 @@ def _least_gap(found: Found, scene: int, pair: int) -> float:
 
 
 @wp.func
-def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches, scene: int, pair: int):
+def _sum_patch(w: CollisionWorld, c: Contacts, patches: Patches, scene: int, pair: int):
     """Force and torque of the contacts of a pair, and the nodes that they are spread over."""
-    a = pair // s.near.shape[0]
-    limit = _least_gap(found, scene, pair) + PATCH
+    a = pair // w.surfaces.near.shape[0]
+    limit = _least_gap(w.found, scene, pair) + PATCH
     nodes = int(0)
     centre = wp.vec3()
-    for k in range(found.near_count[scene, pair]):
-        q = found.near[scene, pair, k]
-        if found.gap[scene, pair, q] < limit:
+    for k in range(w.found.near_count[scene, pair]):
+        q = w.found.near[scene, pair, k]
+        if w.found.gap[scene, pair, q] < limit:
             nodes += 1
-            centre += _place(s, poses, scene, a, q)
+            centre += _place(w, scene, a, q)
     centre = centre / float(wp.max(nodes, 1))
     moment = wp.mat33()
-    for k in range(found.near_count[scene, pair]):
-        q = found.near[scene, pair, k]
-        if found.gap[scene, pair, q] < limit:
-            arm = _place(s, poses, scene, a, q) - centre
+    for k in range(w.found.near_count[scene, pair]):
+        q = w.found.near[scene, pair, k]
+        if w.found.gap[scene, pair, q] < limit:
+            arm = _place(w, scene, a, q) - centre
             moment += wp.dot(arm, arm) * wp.identity(3, dtype=float) - wp.outer(arm, arm)
     force = wp.vec3()
     torque = wp.vec3()
     for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
         J = _single(c.impulse[scene, i])
         force += J
-        torque += wp.cross(_single(c.arm_a[scene, i]) + poses.com[scene, a] - centre, J)
+        torque += wp.cross(_single(c.arm_a[scene, i]) + w.motion.com[scene, a] - centre, J)
     patches.limit[scene, pair] = limit
     patches.centre[scene, pair] = centre
     patches.share[scene, pair] = force / float(wp.max(nodes, 1))
@@ -250,43 +237,47 @@ def _sum_patch(s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, pa
 
 
 @wp.func
-def _spread_over(
-    bodies: BodyProperties, s: SurfaceArrays, poses: BodyPoses, found: Found, c: Contacts, patches: Patches,
-    scene: int, i: int, part: int, parts: int, weight: float,
+def _spread(
+    bodies: BodyProperties, w: CollisionWorld, c: Contacts, patches: Patches, thread: GroupThread, weight: float
 ):  # fmt: skip
-    """Add the accelerations of a part of body i's keypoints by all contacts, times `weight`.
+    """Add the accelerations of the keypoints by all contacts, times `weight`; threads share those of each body.
 
     Forces and torques are divided among the nodes as by interpolation elements (RBE3) of finite-element codes.
     """
-    count = s.near.shape[0]
-    to_body = wp.transpose(poses.R[scene, i])
-    for active in range(c.active_count[scene]):
-        pair = c.active[scene, active]
-        a = pair // count
-        if a == i or pair % count == i:
-            for k in range(found.near_count[scene, pair]):
-                q = found.near[scene, pair, k]
-                row = s.near[a, q]
-                if i != a:
-                    row = found.other[scene, pair, q]
-                if row % parts == part and found.gap[scene, pair, q] < patches.limit[scene, pair]:
-                    arm = _place(s, poses, scene, a, q) - patches.centre[scene, pair]
-                    F = weight * (patches.share[scene, pair] + wp.cross(patches.turn[scene, pair], arm))
+    scene = thread.scene
+    count = w.surfaces.near.shape[0]
+    parts = wp.max(thread.lanes // count, 1)
+    for task in range(thread.lane, count * parts, thread.lanes):
+        i = task // parts
+        part = task % parts
+        to_body = wp.transpose(w.motion.R[scene, i])
+        for active in range(c.active_count[scene]):
+            pair = c.active[scene, active]
+            a = pair // count
+            if a == i or pair % count == i:
+                for k in range(w.found.near_count[scene, pair]):
+                    q = w.found.near[scene, pair, k]
+                    row = w.surfaces.near[a, q]
                     if i != a:
-                        F = -F
-                    mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
-                    before = patches.accelerations[scene, i, row]
-                    patches.accelerations[scene, i, row] = before + to_body * F / mass
+                        row = w.found.other[scene, pair, q]
+                    if row % parts == part and w.found.gap[scene, pair, q] < patches.limit[scene, pair]:
+                        arm = _place(w, scene, a, q) - patches.centre[scene, pair]
+                        F = weight * (patches.share[scene, pair] + wp.cross(patches.turn[scene, pair], arm))
+                        if i != a:
+                            F = -F
+                        mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
+                        before = patches.accelerations[scene, i, row]
+                        patches.accelerations[scene, i, row] = before + to_body * F / mass
 
 
 @wp.func
-def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int, bodies: int):
+def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int):
     """Add the impulses of a pair's contacts on body i."""
     force = wp.vec3d()
     moment = wp.vec3d()
     for k in range(c.first[scene, pair], c.first[scene, pair + 1]):
         J = c.impulse[scene, k]
-        if pair // bodies == i:
+        if pair // patches.load.shape[1] == i:
             force += J
             moment += wp.cross(c.arm_a[scene, k], J)
         else:
@@ -296,62 +287,65 @@ def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int, bodi
     patches.moment[scene, i] = patches.moment[scene, i] + _single(moment)
 
 
+@wp.func
+def _list_contacts(c: Contacts, found: Found, scene: int):
+    """Divide the room for contacts among the pairs."""
+    pairs = found.count.shape[1]
+    total = int(0)
+    active = int(0)
+    for p in range(pairs):
+        c.first[scene, p] = total
+        total = wp.min(total + found.count[scene, p], c.target.shape[1])
+        if total > c.first[scene, p]:
+            c.active[scene, active] = p
+            active += 1
+    c.first[scene, pairs] = total
+    c.active_count[scene] = active
+
+
 @wp.kernel(enable_backward=False)
 def _frames(
-    bodies: BodyProperties, s: SurfaceArrays, m: BodyMotion, poses: BodyPoses, found: Found, inertia: Inertias,
-    v: Velocities, free: Velocities, c: Contacts, memory: SolverMemory, patches: Patches, substeps: int, h: float,
-    lanes: int,
+    bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver, patches: Patches, substeps: int, lanes: int
 ):  # fmt: skip
-    scene = wp.tid() // lanes
-    lane = wp.tid() % lanes
-    count = s.samples.shape[0]
-    pairs = count * count
-    room = c.target.shape[1]
+    thread = GroupThread()
+    thread.scene = wp.tid() // lanes
+    thread.lane = wp.tid() % lanes
+    thread.lanes = lanes
+    scene = thread.scene
+    count = world.surfaces.samples.shape[0]
     for _ in range(substeps):
-        for i in range(lane, count, lanes):
-            _begin(bodies, s, m, poses, inertia, v, free, scene, i, h)
+        for i in range(thread.lane, count, lanes):
+            _begin(bodies, world, solver, scene, i)
         wait_for_group()
-        search(s, poses, found, scene, lane, lanes)
-        if lane == 0:
-            total = int(0)
-            active = int(0)
-            for p in range(pairs):
-                c.first[scene, p] = total
-                total = wp.min(total + found.count[scene, p], room)
-                if total > c.first[scene, p]:
-                    c.active[scene, active] = p
-                    active += 1
-            c.first[scene, pairs] = total
-            c.active_count[scene] = active
+        search(world, thread)
+        if thread.lane == 0:
+            _list_contacts(solver.contacts, world.found, scene)
         wait_for_group()
-        for k in range(lane, c.active_count[scene], lanes):
-            p = c.active[scene, k]
-            i = c.first[scene, p]
+        for k in range(thread.lane, solver.contacts.active_count[scene], lanes):
+            p = solver.contacts.active[scene, k]
+            i = solver.contacts.first[scene, p]
             for slot in range(SLOTS):
-                if found.row[scene, p * SLOTS + slot] != NONE and i < c.first[scene, p + 1]:
-                    _add_contact(bodies, s, m, poses, found, inertia, c, scene, p, slot, i, h)
+                if world.found.row[scene, p * SLOTS + slot] != NONE and i < solver.contacts.first[scene, p + 1]:
+                    _add_contact(bodies, world.motion, solver, contact_in_slot(world, scene, p, slot), scene, i)
                     i += 1
         wait_for_group()
-        if c.first[scene, pairs] > 0:
-            solve(c, inertia, memory, v, free, scene, lane, lanes, count)
-            for k in range(lane, c.active_count[scene], lanes):
-                _sum_patch(s, poses, found, c, patches, scene, c.active[scene, k])
+        if solver.contacts.active_count[scene] > 0:
+            solve(solver, thread)
+            for k in range(thread.lane, solver.contacts.active_count[scene], lanes):
+                _sum_patch(world, solver.contacts, patches, scene, solver.contacts.active[scene, k])
             wait_for_group()
-            for i in range(lane, count, lanes):
-                for k in range(c.active_count[scene]):
-                    p = c.active[scene, k]
+            for i in range(thread.lane, count, lanes):
+                for k in range(solver.contacts.active_count[scene]):
+                    p = solver.contacts.active[scene, k]
                     if p // count == i or p % count == i:
-                        _add_load(c, patches, scene, i, p, count)
-            parts = wp.max(lanes // count, 1)
-            for k in range(lane, count * parts, lanes):
-                weight = 1.0 / (h * float(substeps))
-                _spread_over(bodies, s, poses, found, c, patches, scene, k // parts, k % parts, parts, weight)
+                        _add_load(solver.contacts, patches, scene, i, p)
+            _spread(bodies, world, solver.contacts, patches, thread, 1.0 / (world.motion.step * float(substeps)))
         else:
-            for i in range(lane, count, lanes):
-                v.linear[scene, i] = free.linear[scene, i]
-                v.angular[scene, i] = free.angular[scene, i]
-        for i in range(lane, count, lanes):
-            _end(bodies, m, poses, v, scene, i, h)
+            for i in range(thread.lane, count, lanes):
+                solver.velocities.linear[scene, i] = solver.free.linear[scene, i]
+                solver.velocities.angular[scene, i] = solver.free.angular[scene, i]
+        for i in range(thread.lane, count, lanes):
+            _end(bodies, world.motion, solver.velocities, scene, i)
         wait_for_group()
 
 
@@ -364,18 +358,16 @@ class RigidFrames:
     def __init__(self, surfaces: dict[str, Tensor], scenes: int, keypoints: int):
         self.shape = b, o, _ = scenes, len(surfaces["low"]), keypoints
         self.device = device = device_of(surfaces["depth"])
-        self.surfaces = with_arrays(SurfaceArrays(), surfaces)
-        contacts, samples = CONTACTS_PER_BODY * o, surfaces["samples"].shape[1]
         self.group = 1 if device == "cpu" else GROUP
-        self.motion = empty_arrays(BodyMotion, device, (b, o))
-        self.poses = empty_arrays(BodyPoses, device, (b, o), low=None, high=None, pinned=None, velocity=None, spin=None)
+        samples = surfaces["samples"].shape[1]
         slots, each = (b, o * o * SLOTS), (b, o * o, samples)
-        self.found = empty_arrays(
+        self.world = CollisionWorld()
+        self.world.surfaces = with_arrays(SurfaceArrays(), surfaces)
+        self.world.motion = empty_arrays(BodyMotion, device, (b, o), low=None, high=None, pinned=None)
+        self.world.found = empty_arrays(
             Found, device, (b, o * o), score=slots, row=slots, side=each, gap=each, other=each, near=each
         )
-        self.inertia = empty_arrays(Inertias, device, (b, o), mass=None, pinned=None)
-        self.velocities, self.free = (empty_arrays(Velocities, device, (b, o)) for _ in range(2))
-        self.contacts, self.memory = solver_arrays(device, b, o, contacts, self.group)
+        self.solver = contact_solver(device, b, o, CONTACTS_PER_BODY * o, self.group)
         self.patches = empty_arrays(Patches, device, (b, o * o), accelerations=None, load=None, moment=None)
 
     def advance(
@@ -392,15 +384,13 @@ class RigidFrames:
         new = {k: x.clone(memory_format=torch.contiguous_format) for k, x in zip(names, state, strict=True)}
         accelerations = new["com"].new_zeros(*self.shape, 3)
         load = new["com"].new_zeros(2, *self.shape[:2], 3)
-        with_arrays(self.motion, new)
-        with_arrays(self.poses, {"com": new["com"], "low": box[:, :, 0], "high": box[:, :, 1], "pinned": pinned})
-        self.poses.velocity, self.poses.spin, self.poses.step = self.motion.velocity, self.motion.spin, h
-        with_arrays(self.inertia, {"mass": bodies["mass"], "pinned": pinned})
+        with_arrays(self.world.motion, new | {"low": box[:, :, 0], "high": box[:, :, 1], "pinned": pinned})
+        self.world.motion.step = h
+        with_arrays(self.solver.inertia, {"mass": bodies["mass"], "pinned": pinned})
         with_arrays(self.patches, {"accelerations": accelerations, "load": load[0], "moment": load[1]})
         launch(
             _frames, self.shape[0] * self.group,
-            [with_arrays(BodyProperties(), bodies), self.surfaces, self.motion, self.poses, self.found, self.inertia,
-             self.velocities, self.free, self.contacts, self.memory, self.patches, substeps, h, self.group],
+            [with_arrays(BodyProperties(), bodies), self.world, self.solver, self.patches, substeps, self.group],
             device=self.device, block_dim=self.group,
         )  # fmt: skip
         return *new.values(), accelerations, torch.cat([*load], -1) / (substeps * h)

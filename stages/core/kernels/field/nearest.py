@@ -10,11 +10,12 @@ from torch import Tensor
 
 from stages.core.kernels.operators import operator
 
-BLOCK, CHUNK = 16, 128  # query points per program, and points that it reads at a time
+BLOCK = tl.constexpr(16)  # query points per program
+CHUNK = tl.constexpr(128)  # points that it reads at a time
 
 
 @triton.jit
-def _nearest_kernel(points, low, high, distance, index, radius, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
+def _nearest_kernel(points, low, high, distance, index, radius, o, n):
     blocks = tl.cdiv(n, BLOCK)
     pair, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
     i, j = pair // o, (pair // (o * o)) * o + pair % o  # rows of objects of the same scene
@@ -57,8 +58,8 @@ def _nearest(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[
     b, o, _, n = points.shape
     distance = points.new_empty(b, o, o, n)
     index = torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
-    grid = (b * o * o * triton.cdiv(n, BLOCK),)
-    _nearest_kernel[grid](points, low, high, distance, index, radius, o, n, BLOCK, CHUNK)
+    grid = (b * o * o * triton.cdiv(n, BLOCK.value),)
+    _nearest_kernel[grid](points, low, high, distance, index, radius, o, n)
     return distance, index
 
 

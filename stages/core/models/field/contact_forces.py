@@ -95,7 +95,7 @@ def at_contacts(
     A GPU evaluates all rows: gathering would make the host wait for their count.
     """
     if needed.is_cuda or torch.compiler.is_compiling():
-        return f(*inputs, needed)
+        return f(*inputs, needed=needed)
     rows, n = needed.flatten().nonzero()[:, 0], needed.shape[-1]
     flat = [x.expand(*needed.shape[:3], *x.shape[3:]).flatten(0, 3) for x in inputs]
     values = f(*(x[rows if len(x) == needed.numel() else rows // n] for x in flat))

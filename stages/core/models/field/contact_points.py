@@ -37,6 +37,33 @@ class BodyKinematics(NamedTuple):
     normal: Float[Tensor, "b o n 3"]  # outward, of length up to 1
 
 
+class PairRows(NamedTuple):
+    """What the features of contacts of two bodies are made of, a row for each contact."""
+
+    own: Int[Tensor, "*#r"]  # keypoint, through all objects
+    partner: Int[Tensor, "*#r"]
+    difference: Float[Tensor, "*#r 6"]  # of their positions [m] and velocities [m/s]
+    distances: Float[Tensor, "*#r 3"]  # now, a frame ahead, and the gate
+    inverse: Float[Tensor, "*#r 3 3"]  # inertia of the body, as in BodyKinematics
+    other_inverse: Float[Tensor, "*#r 3 3"]  # that of the partner
+    ratio: Float[Tensor, "*#r"]  # mass of the partner over that of both
+    relative: Float[Tensor, "*#r 3"]  # velocity of the bodies [m/s]
+    gravity: Float[Tensor, "*#r 3"]
+    sizes: Float[Tensor, "*#r 2"]  # of both bodies, logarithms
+
+
+class PlaneRows(NamedTuple):
+    """What the features of contacts with planes are made of, a row for each contact."""
+
+    state: Float[Tensor, "*#r 11"]  # of the keypoint: velocity, normal, arm, spacing, and whether it is one
+    normal: Float[Tensor, "*#r 3"]  # of the plane
+    distances: Float[Tensor, "*#r 3"]  # now, a frame ahead, and the gate
+    inverse: Float[Tensor, "*#r 3 3"]  # inertia of the body, as in BodyKinematics
+    velocity: Float[Tensor, "*#r 3"]  # of the body [m/s]
+    gravity: Float[Tensor, "*#r 3"]
+    size: Float[Tensor, "*#r 1"]  # of the body, logarithm
+
+
 def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     """Contacts of every object with every other one: its nearest keypoints, each with the nearest of the other's.
 
@@ -63,27 +90,26 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
     state = torch.cat([bodies.normal, bodies.arm, shape.spacing[..., None]], -1).flatten(0, 2)
 
-    def features(
-        own: Tensor, partner: Tensor, difference: Tensor, distances: Tensor, inverse: Tensor, other_inverse: Tensor,
-        ratio: Tensor, relative: Tensor, gravity: Tensor, sizes: Tensor, needed: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+    def features(*inputs: Tensor, needed: Tensor | None = None) -> Tensor:
         """Vectors, one after the other, and scalars."""
-        gap, approach = difference.split(3, -1)
-        own_normal, own_arm, own_spacing = _rows(state, own).split([3, 3, 1], -1)
-        normal, arm, spacing = _rows(state, partner).split([3, 3, 1], -1)
-        ratio = ratio[..., None, None]
-        K = ratio * _impulse_response(inverse, own_arm) + (1 - ratio) * _impulse_response(other_inverse, arm)
+        x = PairRows(*inputs)
+        gap, approach = x.difference.split(3, -1)
+        own_normal, own_arm, own_spacing = _rows(state, x.own).split([3, 3, 1], -1)
+        normal, arm, spacing = _rows(state, x.partner).split([3, 3, 1], -1)
+        ratio = x.ratio[..., None, None]
+        K = ratio * _impulse_response(x.inverse, own_arm) + (1 - ratio) * _impulse_response(x.other_inverse, arm)
         vectors = torch.cat([
-            gap / GAP_UNIT, own_normal, normal, approach, own_arm / ARM_UNIT, arm / ARM_UNIT, relative.expand_as(gap),
-            gravity.expand_as(gap), *symmetric_solve(K, approach, normal),
+            gap / GAP_UNIT, own_normal, normal, approach, own_arm / ARM_UNIT, arm / ARM_UNIT, x.relative.expand_as(gap),
+            x.gravity.expand_as(gap), *symmetric_solve(K, approach, normal),
         ], -1)  # fmt: skip
-        sizes = sizes.expand(*gap.shape[:-1], 2)
-        return torch.cat([vectors, distances, own_spacing / GAP_UNIT, spacing / GAP_UNIT, sizes], -1)
+        sizes = x.sizes.expand(*gap.shape[:-1], 2)
+        return torch.cat([vectors, x.distances, own_spacing / GAP_UNIT, spacing / GAP_UNIT, sizes], -1)
 
     of_pairs = [bodies.inverse[:, :, None], bodies.inverse[:, others], ratio, relative, (w.gravity / 5)[:, None, None],
                 sizes]  # fmt: skip
     distances = torch.stack([now / GAP_UNIT, ahead / GAP_UNIT, gate], -1)
-    values = at_contacts(gate > 0, features, *rows, difference, distances, *(x[:, :, :, None] for x in of_pairs))
+    inputs = PairRows(*rows, difference, distances, *(x[:, :, :, None] for x in of_pairs))
+    values = at_contacts(gate > 0, features, *inputs)
     values = _within_cutoff(values, gate)
     return ContactPoints(values[..., :30].unflatten(-1, (10, 3)), values[..., 30:], gate, own)
 
@@ -178,18 +204,16 @@ def _plane_contacts(
     gate = smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT)
     gate = torch.where(state[..., 10] > 0, gate, 0.0)
 
-    def features(
-        state: Tensor, normal: Tensor, distances: Tensor, inverse: Tensor, velocity: Tensor, gravity: Tensor,
-        size: Tensor, needed: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+    def features(*inputs: Tensor, needed: Tensor | None = None) -> Tensor:
         """Vectors, one after the other, and scalars."""
-        point_velocity, own_normal, arm, spacing, _ = state.split([3, 3, 3, 1, 1], -1)
-        K = _impulse_response(inverse, arm)
+        x = PlaneRows(*inputs)
+        point_velocity, own_normal, arm, spacing, _ = x.state.split([3, 3, 3, 1, 1], -1)
+        K = _impulse_response(x.inverse, arm)
         vectors = torch.cat([
-            normal, own_normal, point_velocity, arm / ARM_UNIT, velocity.expand_as(arm), gravity.expand_as(arm),
-            *symmetric_solve(K, point_velocity, normal),
+            x.normal, own_normal, point_velocity, arm / ARM_UNIT, x.velocity.expand_as(arm), x.gravity.expand_as(arm),
+            *symmetric_solve(K, point_velocity, x.normal),
         ], -1)  # fmt: skip
-        return torch.cat([vectors, distances, spacing / GAP_UNIT, size.expand_as(spacing)], -1)
+        return torch.cat([vectors, x.distances, spacing / GAP_UNIT, x.size.expand_as(spacing)], -1)
 
     of_points = [
         state,
@@ -197,7 +221,7 @@ def _plane_contacts(
         torch.stack([(height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate], -1),
     ]
     of_bodies = [bodies.inverse, bodies.velocity, (w.gravity / 5)[:, None], shape.size[..., None].log()]
-    inputs = [*(x[:, :, None] for x in of_points), *(x[:, :, None, None] for x in of_bodies)]
+    inputs = PlaneRows(*(x[:, :, None] for x in of_points), *(x[:, :, None, None] for x in of_bodies))
     gate = gate[:, :, None]
     values = _within_cutoff(at_contacts(gate > 0, features, *inputs), gate)
     return ContactPoints(values[..., :24].unflatten(-1, (8, 3)), values[..., 24:], gate, row[:, :, None])

@@ -48,7 +48,7 @@ from stages.simulate.setup import (
     set_up_scene,
     table_of,
 )
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, object_shape
+from stages.simulate.surface_contacts import BodyFrame, SurfaceContacts, SurfaceShape, ball_shape, object_shape
 from stages.simulate.table_edges import TableEdges
 
 log = logging.getLogger(__name__)
@@ -66,14 +66,14 @@ def rollout(
     world = _World(scene, setup, bodies, prompts, options)
     log.info("%d bodies, %d of them not convex, substep %.3g s (%d per frame)", len(bodies),
              sum(not b.shape.convex for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
-    return _states(scene, keypoints, setup, bodies, world, prompts, options)
+    return _states(world, keypoints, setup, prompts, options)
 
 
 def _states(
-    scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], world: _World, prompts: ForcePrompts,
-    options: SimulateOptions,
-) -> Iterator[FrameState]:  # fmt: skip
+    world: _World, keypoints: Keypoints, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions
+) -> Iterator[FrameState]:
     """Keypoints moved with their bodies."""
+    scene, bodies = world.scene, world.bodies
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.shape.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
@@ -140,8 +140,8 @@ class _World:
         import mujoco  # noqa: PLC0415 -- slow to import
 
         mujoco.set_mju_user_warning(log.debug)  # by default it writes a file where the command was started
-        self._mujoco, self._bodies, self._dt = mujoco, bodies, options.dt
-        self._scene, self._ids = scene, [o.id for o in scene.objects]
+        self._mujoco, self.bodies, self._dt = mujoco, bodies, options.dt
+        self.scene, self._ids = scene, [o.id for o in scene.objects]
         self._held: dict[int, np.ndarray] = {}  # free bodies that are held during the simulation -> their pose
         self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
         unit = scene.metres_per_unit
@@ -193,8 +193,8 @@ class _World:
 
     def _arm(self, at, row: int) -> np.ndarray:
         """From the centre of mass to the point of application, in the body's frame."""
-        com = self._bodies[row].shape.com
-        return ((torch.tensor(at) - com) * self._scene.metres_per_unit / self.units.length).double().numpy()
+        com = self.bodies[row].shape.com
+        return ((torch.tensor(at) - com) * self.scene.metres_per_unit / self.units.length).double().numpy()
 
     def change(self, materials: dict[int, MaterialChoice], pinned: Collection[int], options: SimulateOptions) -> None:
         """Other materials, pins, friction and gravity from now on; objects pinned at the start stay so."""
@@ -202,7 +202,7 @@ class _World:
         model.opt.gravity[2] = -options.gravity * self.units.time**2 / self.units.length
         self.mass = self.mass.clone()  # frames that were yielded keep theirs
         for row, id in enumerate(self._ids):
-            m, b = materials[id].material, self._bodies[row]
+            m, b = materials[id].material, self.bodies[row]
             factor = m.density / b.material.density * b.mass / self.units.mass / model.body_mass[row + 1]
             model.body_mass[row + 1] *= factor
             model.body_inertia[row + 1] *= factor
@@ -217,7 +217,7 @@ class _World:
     def pose(self) -> tuple[Float[Tensor, "o 3"], Float[Tensor, "o 4"]]:
         """Centres of mass [m] and rotations relative to the start (w x y z)."""
         self._mujoco.mj_kinematics(self.model, self.data)
-        count = len(self._bodies) + 1  # 0 is the world
+        count = len(self.bodies) + 1  # 0 is the world
         centre, quat = (torch.from_numpy(a[1:count].copy()).float() for a in (self.data.xpos, self.data.xquat))
         return centre * self.units.length, quat
 
@@ -228,32 +228,32 @@ class _World:
         return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
 
     def _surface_contacts(self, setup: SceneSetup, options: SimulateOptions) -> SurfaceContacts:
-        scale = self._scene.metres_per_unit / self.units.length
+        scale = self.scene.metres_per_unit / self.units.length
 
         def shape(row: int) -> SurfaceShape:
-            b = self._bodies[row]
+            b = self.bodies[row]
             if b.shape.ball is not None:
                 return ball_shape(scale * (b.shape.ball.centre - b.shape.com.double().numpy()),
                                   scale * b.shape.ball.radius)  # fmt: skip
-            ground, com = b.ground / self._scene.metres_per_unit, tuple(b.shape.com.tolist())
-            return object_shape(self._scene, self._ids[row], options.seed, ground, com, scale, b.shape.convex)
+            ground, frame = b.ground / self.scene.metres_per_unit, BodyFrame(tuple(b.shape.com.tolist()), scale)
+            return object_shape(self.scene, self._ids[row], options.seed, ground, frame, b.shape.convex)
 
-        return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self._bodies))))
+        return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self.bodies))))
 
     def _table_edges(self, table: TableOutline) -> TableEdges:
-        scale = self._scene.metres_per_unit / self.units.length
+        scale = self.scene.metres_per_unit / self.units.length
         outline = TableOutline(table.normals, scale * table.offsets, scale * table.ground)
-        corners = [scale * (b.shape.hull - b.shape.com).double().numpy() for b in self._bodies]
+        corners = [scale * (b.shape.hull - b.shape.com).double().numpy() for b in self.bodies]
         return TableEdges(self._mujoco, self.model, self.data, outline, corners)
 
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
         """`data` has the objects as they are in the photos, without lifts."""
-        unit = self._scene.metres_per_unit / self.units.length
+        unit = self.scene.metres_per_unit / self.units.length
         lift = setup.lift.double().numpy() * unit
         self.model.geom_margin[:] = SUPPORT_GAP
         self._mujoco.mj_fwdPosition(self.model, self.data)
         stances, touching = [], self._touching()
-        for i, b in enumerate(self._bodies):
+        for i, b in enumerate(self.bodies):
             points = b.shape.hull.double() * unit
             height = float(b.shape.com[2] * unit - points[:, 2].min())
             start = b.start.double().numpy() / self.units.length - lift[i] - b.shape.com.double().numpy() * unit
@@ -277,7 +277,7 @@ class _World:
         """Let objects move that rested until now."""
         released = self._resting.release(i + 1 for i in rows)
         if released:
-            log.debug("moved from rest: %s", ", ".join(self._scene.objects[i - 1].name for i in released))
+            log.debug("moved from rest: %s", ", ".join(self.scene.objects[i - 1].name for i in released))
 
     def advance(self, time: float) -> None:
         """Advance by a frame that begins at `time` [s]."""

@@ -16,6 +16,7 @@ from stages.core.physics.rigid_shapes import RigidShape
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
 CONTACT_SUBSTEPS = 12  # half a period of the springs that push bodies apart
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
+SOLIMP = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]  # as MuJoCo has it: the same at all depths
 OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
 
 
@@ -77,12 +78,11 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
     if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two hulls; always so from version 4
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
-    impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
     planes = [((0.0, 0.0, level), (0.0, 0.0, 1.0)) for level in levels]
     if box:
         planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
                    for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
-    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance}
+    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": SOLIMP}
     for at, normal in planes:
         quat = np.zeros(4)
         mujoco.mju_quatZ2Vec(quat, np.array(normal))
@@ -90,7 +90,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     for low, high in around:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
     for i, b in enumerate(bodies):
-        _add_body(mujoco, spec, f"body{i}", b, units, gravity, impedance)
+        _add_body(spec, f"body{i}", b, units, gravity)
     for i, b in enumerate(bodies):
         if b.ground / units.length < levels[0]:
             ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
@@ -106,7 +106,9 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
         raise
 
 
-def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, impedance: list) -> None:
+def _add_body(spec, name: str, b: Body, units: Units, gravity: float) -> None:
+    import mujoco  # noqa: PLC0415 -- slow to import
+
     unit = float(b.mass / (b.material.density * b.shape.volume)) ** (1 / 3)  # metres in a scene unit
     body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
     body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
@@ -119,10 +121,10 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, im
         arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)
         at = (ball.centre - b.shape.com.double().numpy()) * unit / units.length
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[ball.radius * unit / units.length, 0, 0], pos=at,
-                      condim=6, friction=[b.friction, 0, arm / units.length], solimp=impedance)  # fmt: skip
+                      condim=6, friction=[b.friction, 0, arm / units.length], solimp=SOLIMP)  # fmt: skip
         return
     vertices = (b.shape.hull - b.shape.com).double() * unit / units.length
     mesh = spec.add_mesh(name=name, uservert=vertices.flatten().tolist())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                  solimp=impedance)  # fmt: skip
+                  solimp=SOLIMP)  # fmt: skip

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -56,16 +57,24 @@ class SurfaceShape:
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of a ball
 
 
+class BodyFrame(NamedTuple):
+    """The frame of a body in the scene."""
+
+    com: tuple[float, ...]  # its origin
+    scale: float  # units of the simulation per scene unit
+
+
 @cached_in_scene
 def object_shape(
-    scene: Scene, object_id: int, seed: int, bottom: float, com: tuple[float, ...], scale: float, convex: bool
+    scene: Scene, object_id: int, seed: int, bottom: float, frame: BodyFrame, convex: bool
 ) -> SurfaceShape:
     """The `surface_shape` of the body of an object. Raises InputError for one without any usable Gaussian."""
-    return surface_shape(solid_surface(scene, object_id, seed), bottom, np.array(com), scale, convex)
+    return surface_shape(solid_surface(scene, object_id, seed), bottom, frame, convex)
 
 
-def surface_shape(body: SolidSurface, bottom: float, com: np.ndarray, scale: float, convex: bool) -> SurfaceShape:
-    """The shape of a body that ends at the height `bottom`, in a frame at `com` with `scale` units per scene unit."""
+def surface_shape(body: SolidSurface, bottom: float, frame: BodyFrame, convex: bool) -> SurfaceShape:
+    """The shape of a body that ends at the height `bottom`, in this frame."""
+    com, scale = np.array(frame.com), frame.scale
     points, normals = body.fitted.samples()
     above = points[:, 2] > bottom
     points, normals = scale * (points[above] - com), normals[above]
@@ -158,7 +167,8 @@ class SurfaceContacts:
         k = np.flatnonzero(excess > 0)
         k = k[_extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
         at = x[k] + depth[k, None] / 2 * normal[k]
-        add_contacts(self._mujoco, self._model, data, at, normal[k], excess[k], self._geom[b[k]], self._geom[a[k]])
+        geoms = np.stack([self._geom[b[k]], self._geom[a[k]]], 1)
+        add_contacts(self._mujoco, self._model, data, AddedContacts(at, normal[k], excess[k], geoms))
 
     def _add_to_planes(self, data, fixed: np.ndarray) -> None:
         """Contacts of the outermost samples with planes."""
@@ -173,8 +183,8 @@ class SurfaceContacts:
         x = turned(data.xmat[1 + of].reshape(-1, 3, 3), self._corners[row[k]]) + data.xpos[1 + of]
         normal = data.geom_xmat[self._planes[plane]][:, 2::3]
         k = _extremes(x, normal, excess, of * len(self._planes) + plane)
-        add_contacts(self._mujoco, self._model, data, x[k], normal[k], excess[k], self._planes[plane[k]],
-                     self._geom[of[k]])  # fmt: skip
+        geoms = np.stack([self._planes[plane[k]], self._geom[of[k]]], 1)
+        add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], excess[k], geoms))
 
     def exclude(self, data) -> None:
         """Exclude the contacts of hulls that surfaces replace."""
@@ -282,19 +292,27 @@ class SurfaceContacts:
         return tuple(np.concatenate(each) for each in zip(*out, strict=True))
 
 
-def add_contacts(mujoco, model, data, x, normal, excess, one, two) -> None:
-    """Add contacts at x (k, 3) of geometries (k,), with normals (k, 3) from the first to the second one, which reach
-    into each other by `excess` (k,).
-    """
+class AddedContacts(NamedTuple):
+    """Contacts of pairs of a MuJoCo model's geometries."""
+
+    x: np.ndarray  # (k, 3), positions
+    normal: np.ndarray  # (k, 3), from the first geometry to the second one
+    excess: np.ndarray  # (k,), by which they reach into each other
+    geoms: np.ndarray  # (k, 2)
+
+
+def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
+    """Add contacts to those found by mj_collision."""
     contact, before = mujoco.MjContact(), data.ncon
     contact.dim = 3
     for name in ("flex", "elem", "vert"):
         getattr(contact, name)[:] = -1
-    for _ in range(len(x)):
+    for _ in range(len(contacts.x)):
         mujoco.mj_addContact(model, data, contact)
     added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer where memory is short
-    x, normal, excess, one, two = x[kept], normal[kept], excess[kept], one[kept], two[kept]
-    added.geom1[new], added.geom2[new], added.geom[new] = one, two, np.stack([one, two], 1)
+    x, normal, excess, geoms = (values[kept] for values in contacts)
+    one, two = geoms.T
+    added.geom1[new], added.geom2[new], added.geom[new] = one, two, geoms
     added.dist[new], added.pos[new] = -excess, x
     added.frame[new] = _frames(normal)
     # as MuJoCo combines those of two geometries

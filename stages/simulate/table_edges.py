@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.perception.table_outline import TableOutline
-from stages.simulate.surface_contacts import add_contacts
+from stages.simulate.surface_contacts import AddedContacts, add_contacts
 
 ON_EDGE = 1e-9  # of the other edges, up to which a point is on the table [units of the simulation]
 
@@ -54,7 +54,8 @@ class TableEdges:
         i, x = np.array([i for i, _ in found]), np.array([x for _, x in found])
         depth = self._floor - x[:, 2] - self._sunk[i]
         up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
-        add_contacts(self._mujoco, self._model, data, x, up, depth, np.zeros(len(x), int), np.array(self._geom)[i])
+        geoms = np.stack([np.zeros(len(x), int), np.array(self._geom)[i]], 1)
+        add_contacts(self._mujoco, self._model, data, AddedContacts(x, up, depth, geoms))
 
     def _heights(self, data, row: int) -> np.ndarray:
         """Those (v,) of the corners of a body's hull."""

@@ -10,7 +10,7 @@ import torch
 from stages.core.physics.solid_surface import SolidSurface, _voxels_along, solid_surface
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, ball_shape, surface_shape
+from stages.simulate.surface_contacts import BodyFrame, SurfaceContacts, SurfaceShape, ball_shape, surface_shape
 from tests.simulate.motion import roll_out
 from tests.simulate.test_rigid import cube, options_of, scene_of
 
@@ -133,7 +133,7 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     body = SolidSurface(np.stack(np.meshgrid(line, line, line[np.abs(line) < 0.25], indexing="ij"), -1).reshape(-1, 3),
                         0.02, points)  # fmt: skip
     com = np.array([0.1, 0.0, 0.05])
-    shape = surface_shape(body, -0.125, com, 2.0, convex=False)
+    shape = surface_shape(body, -0.125, BodyFrame(tuple(com), 2.0), convex=False)
     at = np.round((2 * (np.array([0.0, 0.0, -0.09]) - com) - shape.low) / shape.h).astype(int)
     assert shape.depth[tuple(at)] == pytest.approx(2 * 0.035, abs=0.03) and shape.h == pytest.approx(0.04)
     assert (shape.points[:, 2] / 2 + com[2]).min() > -0.125

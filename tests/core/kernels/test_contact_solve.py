@@ -8,7 +8,8 @@ import pytest
 import torch
 import warp as wp
 
-from stages.core.kernels.field import contact_solve as kernels
+from stages.core.kernels.field.contact_impulses import ContactSolver, contact_solver
+from stages.core.kernels.field.contact_solve import solve as solve_in_group
 from stages.core.kernels.field.groups import GroupThread
 from stages.core.kernels.interop import launch, with_arrays
 from tests.core.kernels import contact_reference as reference
@@ -18,11 +19,11 @@ GROUP = {"cpu": 1, "cuda": 64}  # threads
 
 
 @wp.kernel(enable_backward=False)
-def _solve(solver: kernels.ContactSolver, lanes: int):
+def _solve(solver: ContactSolver, lanes: int):
     thread = GroupThread()
     thread.lane = wp.tid()
     thread.lanes = lanes
-    kernels.solve(solver, thread)
+    solve_in_group(solver, thread)
 
 
 def solve(
@@ -32,7 +33,7 @@ def solve(
     o, group = len(bodies.mass), GROUP[device]
     pair = contacts.a * o + contacts.b
     order = pair.argsort(stable=True)
-    solver = kernels.contact_solver(device, 1, o, len(pair), group)
+    solver = contact_solver(device, 1, o, len(pair), group)
     first = torch.searchsorted(pair[order].contiguous(), torch.arange(o * o + 1)).int()
     active = (first.diff() > 0).nonzero()[:, 0]
 

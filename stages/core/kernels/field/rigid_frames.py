@@ -12,6 +12,15 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from stages.core.kernels.field.contact_impulses import (
+    FRICTION_REGULARISATION,
+    NORMAL_REGULARISATION,
+    Contacts,
+    ContactSolver,
+    Velocities,
+    contact_solver,
+    effective_response,
+)
 from stages.core.kernels.field.contact_search import (
     MARGIN,
     NONE,
@@ -24,16 +33,7 @@ from stages.core.kernels.field.contact_search import (
     contact_in_slot,
     search,
 )
-from stages.core.kernels.field.contact_solve import (
-    FRICTION_REGULARISATION,
-    NORMAL_REGULARISATION,
-    Contacts,
-    ContactSolver,
-    Velocities,
-    contact_solver,
-    effective_response,
-    solve,
-)
+from stages.core.kernels.field.contact_solve import solve
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
 from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays

@@ -25,6 +25,20 @@ class Velocities:
 
 
 @wp.struct
+class BodyProperties:
+    """Properties of the bodies of each scene."""
+
+    mass: wp.array2d[float]  # [kg]
+    inertia: wp.array2d[wp.mat33]  # per unit of mass, rest orientation [m^2]
+    inverse: wp.array2d[wp.mat33]
+    friction: wp.array2d[float]
+    loss: wp.array2d[float]
+    acceleration: wp.array2d[wp.vec3]  # without contact, of the centres of mass [m/s^2]
+    twist: wp.array2d[wp.vec3]  # torque per unit of mass [m^2/s^2]
+    mass_fraction: wp.array3d[float]  # of keypoints
+
+
+@wp.struct
 class Inertias:
     """Inertia of the bodies of each scene, in world axes."""
 

@@ -15,12 +15,14 @@ from torch import Tensor
 from stages.core.kernels.field.contact_impulses import (
     FRICTION_REGULARISATION,
     NORMAL_REGULARISATION,
+    BodyProperties,
     Contacts,
     ContactSolver,
     Velocities,
     contact_solver,
     effective_response,
 )
+from stages.core.kernels.field.contact_patches import Patches, add_load, single, spread, sum_patch
 from stages.core.kernels.field.contact_search import (
     MARGIN,
     NONE,
@@ -45,47 +47,12 @@ RECOVERY = wp.constant(0.2)  # share of an overlap that is removed in a step (Ba
 MAX_RECOVERY_SPEED = wp.constant(0.3)  # [m/s], about the speed below which bodies do not rebound
 REBOUND_SPEED = wp.constant(0.2)  # least speed of approach that rebounds [m/s]: of a fall of a hundredth of an object
 ROUGHNESS = wp.constant(0.005)  # gap up to which points take part in an impact, as surfaces are known to [m]
-PATCH = wp.constant(0.02)  # samples with gaps this much larger than the least share a contact's force [m]
 HALF_PI = wp.constant(math.pi / 2)
-
-
-@wp.struct
-class BodyProperties:
-    """Properties of the bodies of each scene."""
-
-    mass: wp.array2d[float]  # [kg]
-    inertia: wp.array2d[wp.mat33]  # per unit of mass, rest orientation [m^2]
-    inverse: wp.array2d[wp.mat33]
-    friction: wp.array2d[float]
-    loss: wp.array2d[float]
-    acceleration: wp.array2d[wp.vec3]  # without contact, of the centres of mass [m/s^2]
-    twist: wp.array2d[wp.vec3]  # torque per unit of mass [m^2/s^2]
-    mass_fraction: wp.array3d[float]  # of keypoints
-
-
-@wp.struct
-class Patches:
-    """How the contacts of each pair are spread over its nodes, the samples that touch: at x each bears
-    share + turn x (x - centre).
-    """
-
-    limit: wp.array2d[float]  # of the nodes' gaps [m]
-    centre: wp.array2d[wp.vec3]
-    share: wp.array2d[wp.vec3]
-    turn: wp.array2d[wp.vec3]
-    accelerations: wp.array3d[wp.vec3]  # of keypoints in the bodies' frames; the result
-    load: wp.array2d[wp.vec3]  # sum of all impulses on each body; the result
-    moment: wp.array2d[wp.vec3]  # that about its centre of mass
 
 
 @wp.func
 def _double(x: wp.vec3) -> wp.vec3d:
     return wp.vec3d(f64(x[0]), f64(x[1]), f64(x[2]))
-
-
-@wp.func
-def _single(x: wp.vec3d) -> wp.vec3:
-    return wp.vec3(float(x[0]), float(x[1]), float(x[2]))
 
 
 @wp.func
@@ -179,112 +146,15 @@ def _add_contact(bodies: BodyProperties, m: BodyMotion, solver: ContactSolver, n
 @wp.func
 def _end(bodies: BodyProperties, m: BodyMotion, v: Velocities, scene: int, i: int):
     """The second half of a substep."""
-    velocity = _single(v.linear[scene, i])
+    velocity = single(v.linear[scene, i])
     R = m.R[scene, i]
-    momentum = R * (bodies.inertia[scene, i] * (wp.transpose(R) * _single(v.angular[scene, i])))
+    momentum = R * (bodies.inertia[scene, i] * (wp.transpose(R) * single(v.angular[scene, i])))
     if m.pinned[scene, i]:
         velocity = wp.vec3()
         momentum = wp.vec3()
     m.velocity[scene, i] = velocity
     m.momentum[scene, i] = momentum
     _drifted(m, bodies, scene, i, m.step / 2.0)
-
-
-@wp.func
-def _place(w: CollisionWorld, scene: int, a: int, q: int) -> wp.vec3:
-    return w.motion.com[scene, a] + w.motion.R[scene, a] * w.surfaces.samples[a, q]
-
-
-@wp.func
-def _least_gap(found: Found, scene: int, pair: int) -> float:
-    out = float(1.0e30)
-    for k in range(found.near_count[scene, pair]):
-        out = wp.min(out, found.gap[scene, pair, found.near[scene, pair, k]])
-    return out
-
-
-@wp.func
-def _sum_patch(w: CollisionWorld, c: Contacts, patches: Patches, scene: int, pair: int):
-    """Force and torque of the contacts of a pair, and the nodes that they are spread over."""
-    a = pair // w.surfaces.near.shape[0]
-    limit = _least_gap(w.found, scene, pair) + PATCH
-    nodes = int(0)
-    centre = wp.vec3()
-    for k in range(w.found.near_count[scene, pair]):
-        q = w.found.near[scene, pair, k]
-        if w.found.gap[scene, pair, q] < limit:
-            nodes += 1
-            centre += _place(w, scene, a, q)
-    centre = centre / float(wp.max(nodes, 1))
-    moment = wp.mat33()
-    for k in range(w.found.near_count[scene, pair]):
-        q = w.found.near[scene, pair, k]
-        if w.found.gap[scene, pair, q] < limit:
-            arm = _place(w, scene, a, q) - centre
-            moment += wp.dot(arm, arm) * wp.identity(3, dtype=float) - wp.outer(arm, arm)
-    force = wp.vec3()
-    torque = wp.vec3()
-    for i in range(c.first[scene, pair], c.first[scene, pair + 1]):
-        J = _single(c.impulse[scene, i])
-        force += J
-        torque += wp.cross(_single(c.arm_a[scene, i]) + w.motion.com[scene, a] - centre, J)
-    patches.limit[scene, pair] = limit
-    patches.centre[scene, pair] = centre
-    patches.share[scene, pair] = force / float(wp.max(nodes, 1))
-    # a multiple of the identity: nodes on a line cannot bear a torque about it
-    extra = 1.0e-2 * wp.trace(moment) + 1.0e-9
-    patches.turn[scene, pair] = wp.inverse(moment + extra * wp.identity(3, dtype=float)) * torque
-
-
-@wp.func
-def _spread(
-    bodies: BodyProperties, w: CollisionWorld, c: Contacts, patches: Patches, thread: GroupThread, weight: float
-):  # fmt: skip
-    """Add the accelerations of the keypoints by all contacts, times `weight`; threads share those of each body.
-
-    Forces and torques are divided among the nodes as by interpolation elements (RBE3) of finite-element codes.
-    """
-    scene = thread.scene
-    count = w.surfaces.near.shape[0]
-    parts = wp.max(thread.lanes // count, 1)
-    for task in range(thread.lane, count * parts, thread.lanes):
-        i = task // parts
-        part = task % parts
-        to_body = wp.transpose(w.motion.R[scene, i])
-        for active in range(c.active_count[scene]):
-            pair = c.active[scene, active]
-            a = pair // count
-            if a == i or pair % count == i:
-                for k in range(w.found.near_count[scene, pair]):
-                    q = w.found.near[scene, pair, k]
-                    row = w.surfaces.near[a, q]
-                    if i != a:
-                        row = w.found.other[scene, pair, q]
-                    if row % parts == part and w.found.gap[scene, pair, q] < patches.limit[scene, pair]:
-                        arm = _place(w, scene, a, q) - patches.centre[scene, pair]
-                        F = weight * (patches.share[scene, pair] + wp.cross(patches.turn[scene, pair], arm))
-                        if i != a:
-                            F = -F
-                        mass = bodies.mass[scene, i] * wp.max(bodies.mass_fraction[scene, i, row], 1.0e-9)
-                        before = patches.accelerations[scene, i, row]
-                        patches.accelerations[scene, i, row] = before + to_body * F / mass
-
-
-@wp.func
-def _add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int):
-    """Add the impulses of a pair's contacts on body i."""
-    force = wp.vec3d()
-    moment = wp.vec3d()
-    for k in range(c.first[scene, pair], c.first[scene, pair + 1]):
-        J = c.impulse[scene, k]
-        if pair // patches.load.shape[1] == i:
-            force += J
-            moment += wp.cross(c.arm_a[scene, k], J)
-        else:
-            force -= J
-            moment -= wp.cross(c.arm_b[scene, k], J)
-    patches.load[scene, i] = patches.load[scene, i] + _single(force)
-    patches.moment[scene, i] = patches.moment[scene, i] + _single(moment)
 
 
 @wp.func
@@ -332,14 +202,14 @@ def _frames(
         if solver.contacts.active_count[scene] > 0:
             solve(solver, thread)
             for k in range(thread.lane, solver.contacts.active_count[scene], lanes):
-                _sum_patch(world, solver.contacts, patches, scene, solver.contacts.active[scene, k])
+                sum_patch(world, solver.contacts, patches, scene, solver.contacts.active[scene, k])
             wait_for_group()
             for i in range(thread.lane, count, lanes):
                 for k in range(solver.contacts.active_count[scene]):
                     p = solver.contacts.active[scene, k]
                     if p // count == i or p % count == i:
-                        _add_load(solver.contacts, patches, scene, i, p)
-            _spread(bodies, world, solver.contacts, patches, thread, 1.0 / (world.motion.step * float(substeps)))
+                        add_load(solver.contacts, patches, scene, i, p)
+            spread(bodies, world, solver.contacts, patches, thread, 1.0 / (world.motion.step * float(substeps)))
         else:
             for i in range(thread.lane, count, lanes):
                 solver.velocities.linear[scene, i] = solver.free.linear[scene, i]

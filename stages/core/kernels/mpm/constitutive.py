@@ -25,6 +25,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from stages.core.kernels.mpm.transfers import ParticleArrays
+
 NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
 MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
 MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
@@ -175,16 +177,13 @@ def material_update(
     return out
 
 
-@wp.kernel
-def _update(
-    model: wp.array[wp.int8], dt: float, F: wp.array[wp.mat33], stiffness: wp.array[wp.vec3],
-    plastic: wp.array[wp.vec3], state: wp.array[float], tau: wp.array[wp.mat33],
-):  # fmt: skip
+@wp.kernel(enable_backward=False)
+def _update(rows: ParticleArrays, dt: float, tau: wp.array[wp.mat33]):
     i = wp.tid()
-    out = material_update(int(model[i]), F[i], stiffness[i], plastic[i], state[i], dt)
-    F[i] = out.F
+    out = material_update(int(rows.model[i]), rows.F[i], rows.stiffness[i], rows.plastic[i], rows.state[i], dt)
+    rows.F[i] = out.F
     tau[i] = out.tau
-    state[i] = out.state
+    rows.state[i] = out.state
 
 
 def update_materials(
@@ -195,11 +194,12 @@ def update_materials(
     model (p) int8; F (p, 3, 3): trial; stiffness (p, 3): mu, lambda [Pa], eta (not used here); plastic (p, 3); state
     (p); dt [s].
     """
-    from stages.core.kernels.interop import device_of, launch, view
+    from stages.core.kernels.interop import device_of, launch, view, with_arrays
 
     F, state, tau = F.clone(), state.clone(), torch.empty_like(F)
-    launch(_update, len(F), [view(model), dt, view(F, wp.mat33), view(stiffness, wp.vec3), view(plastic, wp.vec3),
-                              view(state), view(tau, wp.mat33)], device=device_of(F))  # fmt: skip
+    tensors = {"model": model, "F": F, "stiffness": stiffness, "plastic": plastic, "state": state}
+    rows = with_arrays(ParticleArrays(), tensors)
+    launch(_update, len(F), [rows, dt, view(tau, wp.mat33)], device=device_of(F))
     return F, tau, state
 
 

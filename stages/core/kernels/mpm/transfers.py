@@ -143,14 +143,16 @@ def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
 
 
 def substep_reference(
-    x: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor, volume: Tensor, stiffness: Tensor, push: Tensor,
-    dt: float, dx: float, nodes: tuple[int, int, int], low: Tensor, high: Tensor, friction: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """One substep of free neo-Hookean particles in PyTorch, with the grid's origin at 0: specification of the kernels.
+    rows: dict[str, Tensor], grid: MpmGrid, friction: float, dt: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One substep of `dt` [s] of free neo-Hookean particles in PyTorch: specification of the kernels.
 
-    x, v, push (external acceleration [m/s^2]) (p, 3); C, F (p, 3, 3); mass, volume (p); stiffness (p, 3); low, high
-    (3,) node indices of the walls. Returns x, v, C, F.
+    rows: x, v, C, F, mass, volume, stiffness and acceleration, as in ParticleArrays; `friction` of floor and walls.
+    Returns x, v, C, F.
     """
+    v, C, F, mass, volume, stiffness = (rows[k] for k in ("v", "C", "F", "mass", "volume", "stiffness"))
+    dx, nodes, origin = grid.dx, tuple(grid.nodes), torch.tensor(list(grid.origin)).to(v)
+    x = rows["x"] - origin
     offsets = torch.cartesian_prod(*[torch.arange(3)] * 3)
     base = (x / dx - 0.5).floor().long()
     fx = x / dx - base
@@ -165,14 +167,14 @@ def substep_reference(
     tau = stiffness[:, 0, None, None] * (F @ F.mT - one) + (stiffness[:, 1] * J.log())[:, None, None] * one
     tau = tau + stiffness[:, 2, None, None] * (C + C.mT)
     A = mass[:, None, None] * C - (dt * volume * 4 / dx**2)[:, None, None] * tau
-    momentum = (mass[:, None] * (v + dt * push))[:, None] + torch.einsum("pab,pnb->pna", A, offset)
+    momentum = (mass[:, None] * (v + dt * rows["acceleration"]))[:, None] + torch.einsum("pab,pnb->pna", A, offset)
     count = nodes[0] * nodes[1] * nodes[2]
     grid_m = torch.zeros(count).to(x).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
     grid_v = torch.zeros(count, 3).to(x).index_add(0, flat.flatten(), (weight[..., None] * momentum).flatten(0, 1))
     grid_v = grid_v / grid_m.clamp_min(1e-30)[:, None]
 
     at = torch.cartesian_prod(*[torch.arange(n) for n in nodes])
-    for axis, sign, hit in [(a, s, at[:, a] <= low[a] if s > 0 else at[:, a] >= high[a]) for a in (2, 1, 0)
+    for axis, sign, hit in [(a, s, at[:, a] <= grid.low[a] if s > 0 else at[:, a] >= grid.high[a]) for a in (2, 1, 0)
                             for s in (1.0, -1.0)]:  # fmt: skip
         across = sign * grid_v[:, axis]
         along = grid_v.clone()
@@ -184,4 +186,4 @@ def substep_reference(
     near = grid_v[flat]
     v = (weight[..., None] * near).sum(1)
     C = 4 / dx**2 * torch.einsum("pn,pna,pnb->pab", weight, near, offset)
-    return x + dt * v, v, C, F + dt * C @ F
+    return rows["x"] + dt * v, v, C, F + dt * C @ F

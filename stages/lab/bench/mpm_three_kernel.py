@@ -12,7 +12,7 @@ from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.constitutive import neo_hookean
 from stages.core.kernels.mpm.grid import MpmGrid, apply_walls, bspline_weights, first_node
 from stages.core.kernels.mpm.nodes import mat43
-from stages.core.kernels.mpm.transfers import ParticleArrays, ParticleUpdate, advance_free, affine_momentum
+from stages.core.kernels.mpm.transfers import FREE, ParticleArrays, ParticleUpdate, advance_free, affine_momentum
 from stages.core.physics.mpm.solver import Solver
 
 
@@ -23,8 +23,8 @@ def _to_grid(grid: MpmGrid, rows: ParticleArrays, dt: float, nodes: wp.array2d[f
     now.x = rows.x[i]
     now.v = rows.v[i]
     now.C = rows.C[i]
-    tau = neo_hookean(rows.F[i], rows.stiffness[i])
-    load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], 0.0, rows.acceleration[i], 0, dt, 0.0)
+    now.tau = neo_hookean(rows.F[i], rows.stiffness[i])
+    load = affine_momentum(grid, rows, i, now, FREE, dt)
     g = (now.x - grid.origin) / grid.dx
     base = first_node(g)
     fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))

@@ -170,7 +170,7 @@ def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(devi
             toward = torch.randn(joined.x.shape, generator=torch.Generator().manual_seed(seed)).sign() * torch.inf
             start = replace(joined, x=torch.nextafter(joined.x, toward))
         solver = mpm.Solver(start, BOX, DX, device, mpm.SolverOptions(schedule="contact"), sizes)
-        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(start, sizes, None)
+        shared = solver.rows, False, False, solver._body_contact(start, sizes, None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         return torch.cat(moved(solver, sizes, 10, G)[0])
 

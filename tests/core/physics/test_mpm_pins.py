@@ -170,7 +170,7 @@ def test_the_schedule_for_gpus_gives_the_same_motion_of_what_is_pinned_and_repea
 
     def run(kind):
         solver = solver_of(p, dx, device)
-        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(p, [len(p)], None)
+        shared = solver.rows, False, False, solver._body_contact(p, [len(p)], None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         ends = []
         for held in (p.rest[:, 0] < 0, p.rest[:, 0] < 0.1):

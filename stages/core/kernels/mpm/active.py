@@ -10,8 +10,8 @@ import warp as wp
 
 from stages.core.kernels.mpm.contact import BLOCK_NODES, ContactBodies, may_touch, resolve_node
 from stages.core.kernels.mpm.exact import velocity_from_exact
-from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, Obstacle, apply_boundaries, near_walls
-from stages.core.kernels.mpm.transfers import ParticleArrays
+from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, NodeArrays, apply_boundaries, near_walls
+from stages.core.kernels.mpm.transfers import ParticleArrays, Substep
 
 
 @wp.struct
@@ -22,6 +22,8 @@ class ActiveBlocks:
     blocks: wp.array[int]
     total: wp.array[int]
     sharers: wp.array[int]  # number of scenes for which a block is active
+    sweepers: int  # threads of a launch over the blocks
+    stale: wp.array[int]  # where the host lists the blocks (split.py): set when a particle moves beyond them
 
 
 @wp.func
@@ -69,33 +71,21 @@ def _position(grid: MpmGrid, node: int) -> wp.vec3i:
 
 
 @wp.kernel(enable_backward=False)
-def grid_sweep(
-    grid: MpmGrid, sweepers: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4],
-    friction: wp.array[float], active: ActiveBlocks, obstacles: wp.array[Obstacle], clock: wp.array[float],
-    scale: wp.vec2,
-):  # fmt: skip
-    """Momentum in fixed point, which is cleared, to velocities after walls and obstacles; a row of four nodes each.
-
-    clock: time since the start of the frame [s], for moving obstacles.
-    """
+def grid_sweep(grid: MpmGrid, nodes: NodeArrays, active: ActiveBlocks, step: Substep):
+    """Momentum in fixed point, which is cleared, to velocities after walls and obstacles; a row of four nodes each."""
     t = wp.tid()
     while t < active.total[0] * BLOCK * BLOCK:
         first = node_of_block(grid, active.blocks[t // (BLOCK * BLOCK)], (t % (BLOCK * BLOCK)) * BLOCK)
-        velocity_from_exact(momentum, velocity, first, scale)
-        apply_boundaries(grid, velocity, friction, obstacles, clock[0], first, _position(grid, first))
-        t += sweepers
+        velocity_from_exact(nodes.momentum, nodes.velocity, first, nodes.scale)
+        apply_boundaries(grid, nodes, step.clock[0], first, _position(grid, first))
+        t += active.sweepers
 
 
 @wp.kernel(enable_backward=False)
 def contact_sweep(
-    grid: MpmGrid, sweepers: int, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
-    nearest: wp.array[wp.int64], present: wp.array[int], friction: wp.array[float], active: ActiveBlocks,
-    dt: wp.array[float], clear: int,
-):  # fmt: skip
-    """Contact at the nodes of blocks that may have it; the thread of the first body in a block acts for all.
-
-    `present` lists all bodies; other arguments as `contact.contact_step`.
-    """
+    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, active: ActiveBlocks, step: Substep
+):
+    """Contact at the nodes of blocks that may have it; the thread of the first body in a block acts for all."""
     t = wp.tid()
     blocks = grid.count // BLOCK_NODES  # of a body
     while t < active.total[0] * BLOCK_NODES:
@@ -108,27 +98,27 @@ def contact_sweep(
             while active.marks[first * blocks + here] == 0:
                 first += 1
             if first == block // blocks:
-                resolve_node(grid, rows, bodies, velocity, nearest, present, first, present.shape[0], at[0], at[1],
-                             at[2], friction, dt[0], clear)  # fmt: skip
-        t += sweepers
+                resolve_node(grid, rows, bodies, nodes, bodies.all[first:], at, step)
+        t += active.sweepers
 
 
 @wp.kernel(enable_backward=False)
 def clear_active_blocks(
-    grid: MpmGrid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
-    friction: wp.array[float], active: ActiveBlocks, width: int,
+    grid: MpmGrid, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4], friction: wp.array[float],
+    active: ActiveBlocks,
 ):  # fmt: skip
     """Clear all grids and marks at the end of a frame; the caller then resets the number of active blocks."""
     t = wp.tid()
+    width = a.shape[0] // friction.shape[0]  # vec4 per node
     nodes = active.total[0] * BLOCK * BLOCK * BLOCK
     while t < nodes:
         block = active.blocks[t // 64]
         node = node_of_block(grid, block, t % 64)
-        for n in range(width):  # `width` vec4 per node
+        for n in range(width):
             a[node * width + n] = wp.vec4()
             b[node * width + n] = wp.vec4()
             c[node * width + n] = wp.vec4()
         friction[node] = 0.0
         active.marks[block] = 0
         active.sharers[block % (grid.count // BLOCK_NODES)] = 0
-        t += sweepers
+        t += active.sweepers

@@ -18,8 +18,8 @@ from __future__ import annotations
 import warp as wp
 
 from stages.core.kernels.mpm.constitutive import SAND
-from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, apply_walls, coulomb_contact, first_node
-from stages.core.kernels.mpm.transfers import FREE, LOST, ParticleArrays
+from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, NodeArrays, apply_walls, coulomb_contact, first_node
+from stages.core.kernels.mpm.transfers import FREE, LOST, ParticleArrays, Substep
 
 # Height above the floor or a held body up to which nodes stop [cells]. Stopping higher ones takes more of the energy of
 # an impact, lower ones alone let bodies sink further. With CONTACT_FLOOR_GAP (solver.py) chosen on a tower of six, the
@@ -46,13 +46,25 @@ class ContactBodies:
     origin: wp.array[wp.vec3]  # material coordinates of the first texel [m]
     spacing: wp.array[float]  # [m]
     friction: wp.array[float]  # Coulomb coefficient
+    all: wp.array[int]  # 0, 1, ...: the numbers of the bodies
+
+
+@wp.struct
+class TouchingBlocks:
+    """Blocks that may have contact, each with the bodies `present[starts[b] : starts[b + 1]]`."""
+
+    corners: wp.array[int]  # first node of each block
+    starts: wp.array[int]
+    present: wp.array[int]
 
 
 @wp.struct
 class ContactPatch:
-    """A body near one of its particles."""
+    """A body at a node, near the particle of it that is nearest to the node."""
 
     body: int
+    node: int  # index over the grids of all bodies
+    place: wp.vec3  # of the node [m]
     held: bool
     x: wp.vec3  # the particle [m]
     X: wp.vec3  # its material coordinates [m]
@@ -61,10 +73,12 @@ class ContactPatch:
 
 
 @wp.func
-def _patch(rows: ParticleArrays, key: wp.int64, body: int) -> ContactPatch:
+def _patch(rows: ParticleArrays, key: wp.int64, body: int, node: int, place: wp.vec3) -> ContactPatch:
     p = int(key % ROW)
     out = ContactPatch()
     out.body = body
+    out.node = node
+    out.place = place
     out.held = int(rows.held[p]) != FREE
     out.x = rows.x[p]
     out.X = rows.rest[p]
@@ -132,20 +146,18 @@ def _contact_normal(other: wp.vec4, own: wp.vec4) -> wp.vec3:
 
 @wp.func
 def _resolve_pair(
-    grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, b: ContactPatch, node: int,
-    place: wp.vec3, dt: float,
-) -> bool:  # fmt: skip
+    grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, b: ContactPatch, dt: float
+):
     """Limit the approach of two bodies at a node to their gap, with friction; momentum is kept."""
-    first = a.body * grid.count + node
-    second = b.body * grid.count + node
-    u = velocity[first]
-    v = velocity[second]
+    place = a.place
+    u = velocity[a.node]
+    v = velocity[b.node]
     if u[3] <= 0.0 or v[3] <= 0.0:
-        return False
+        return
     of_a = surface_at(bodies, a, place)
     of_b = surface_at(bodies, b, place)
     if (a.held and of_a[3] > STATIC_REACH * grid.dx) or (b.held and of_b[3] > STATIC_REACH * grid.dx):
-        return False
+        return
     on_a = _on_surface(of_a, place)
     on_b = _on_surface(of_b, place)
     at_a = surface_at(bodies, a, on_b)
@@ -159,32 +171,24 @@ def _resolve_pair(
     relative = wp.vec3(u[0] - v[0], u[1] - v[1], u[2] - v[2]) - free
     change = relative - coulomb_contact(relative, -normal, wp.max(bodies.friction[a.body], bodies.friction[b.body]))
     if wp.dot(change, normal) <= 0.0:
-        return False
+        return
     share = v[3] / (u[3] + v[3])
     more = 1.0 - share
-    velocity[first] = wp.vec4(u[0] - share * change[0], u[1] - share * change[1], u[2] - share * change[2], u[3])
-    velocity[second] = wp.vec4(v[0] + more * change[0], v[1] + more * change[1], v[2] + more * change[2], v[3])
-    return True
+    velocity[a.node] = wp.vec4(u[0] - share * change[0], u[1] - share * change[1], u[2] - share * change[2], u[3])
+    velocity[b.node] = wp.vec4(v[0] + more * change[0], v[1] + more * change[1], v[2] + more * change[2], v[3])
 
 
 @wp.func
-def _resolve_floor(
-    grid: MpmGrid,
-    bodies: ContactBodies,
-    velocity: wp.array[wp.vec4],
-    a: ContactPatch,
-    node: int,
-    place: wp.vec3,
-    dt: float,
-):
+def _resolve_floor(grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, dt: float):
     """Limit the approach of a body to the floor at a node, with friction."""
+    place = a.place
     of_a = surface_at(bodies, a, place)
     at_a = surface_at(bodies, a, wp.vec3(place[0], place[1], grid.face_low[2]))
     gap = wp.min(at_a[3], _on_surface(of_a, place)[2] - grid.face_low[2]) - FLOOR_REST * grid.dx
-    u = velocity[a.body * grid.count + node]
+    u = velocity[a.node]
     free = wp.vec3(0.0, 0.0, -wp.max(gap, 0.0) / dt)
     v = free + coulomb_contact(wp.vec3(u[0], u[1], u[2]) - free, wp.vec3(0.0, 0.0, 1.0), bodies.friction[a.body])
-    velocity[a.body * grid.count + node] = wp.vec4(v[0], v[1], v[2], u[3])
+    velocity[a.node] = wp.vec4(v[0], v[1], v[2], u[3])
 
 
 @wp.func
@@ -196,38 +200,40 @@ def may_touch(grid: MpmGrid, sharers: wp.array[int], i: int, j: int, k: int) -> 
 
 @wp.func
 def resolve_node(
-    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
-    nearest: wp.array[wp.int64], present: wp.array[int], start: int, stop: int, i: int, j: int, k: int,
-    wall_friction: wp.array[float], dt: float, clear: int,
+    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, present: wp.array[int],
+    at: wp.vec3i, step: Substep,
 ):  # fmt: skip
-    """Contact at a node between those of the bodies `present[start:stop]` that reach it; `clear` clears their keys."""
-    node = (i * grid.nodes[1] + j) * grid.nodes[2] + k
-    place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))
+    """Contact at node `at` between those of the bodies `present` that reach it."""
+    node = (at[0] * grid.nodes[1] + at[1]) * grid.nodes[2] + at[2]
+    place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     here = int(0)
-    for p in range(start, stop):
-        here += wp.where(nearest[present[p] * grid.count + node] < NONE, 1, 0)
+    for p in range(present.shape[0]):
+        here += wp.where(nodes.nearest[present[p] * grid.count + node] < NONE, 1, 0)
     for _ in range(wp.where(here > 2, SWEEPS, wp.where(here > 1, 1, 0))):
-        for p in range(start, stop):
-            key = nearest[present[p] * grid.count + node]
+        for p in range(present.shape[0]):
+            own = present[p] * grid.count + node
+            key = nodes.nearest[own]
             if key < NONE:
-                a = _patch(rows, key, present[p])
-                for q in range(p + 1, stop):
-                    other = nearest[present[q] * grid.count + node]
-                    if other < NONE:
-                        _resolve_pair(grid, bodies, velocity, a, _patch(rows, other, present[q]), node, place, dt)
+                a = _patch(rows, key, present[p], own, place)
+                for q in range(p + 1, present.shape[0]):
+                    other = present[q] * grid.count + node
+                    theirs = nodes.nearest[other]
+                    if theirs < NONE:
+                        b = _patch(rows, theirs, present[q], other, place)
+                        _resolve_pair(grid, bodies, nodes.velocity, a, b, step.dt)
     at_floor = place[2] - grid.face_low[2] <= STATIC_REACH * grid.dx
-    for p in range(start, stop):
+    for p in range(present.shape[0]):
         own = present[p] * grid.count + node
-        key = nearest[own]
+        key = nodes.nearest[own]
         if key < NONE:
-            if clear > 0:
-                nearest[own] = NONE
+            if step.forget > 0:
+                nodes.nearest[own] = NONE
             if at_floor:
-                _resolve_floor(grid, bodies, velocity, _patch(rows, key, present[p]), node, place, dt)
+                _resolve_floor(grid, bodies, nodes.velocity, _patch(rows, key, present[p], own, place), step.dt)
             if here > 1:
-                w = velocity[own]
-                inside = apply_walls(grid, wp.vec3i(i, j, k), wp.vec3(w[0], w[1], w[2]), wall_friction[own])
-                velocity[own] = wp.vec4(inside[0], inside[1], inside[2], w[3])
+                w = nodes.velocity[own]
+                inside = apply_walls(grid, at, wp.vec3(w[0], w[1], w[2]), nodes.friction[own])
+                nodes.velocity[own] = wp.vec4(inside[0], inside[1], inside[2], w[3])
 
 
 @wp.kernel(enable_backward=False)
@@ -265,20 +271,16 @@ def find_nearest(grid: MpmGrid, rows: ParticleArrays, sharers: wp.array[int], ne
 
 @wp.kernel(enable_backward=False)
 def contact_step(
-    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
-    nearest: wp.array[wp.int64], corners: wp.array[int], starts: wp.array[int], present: wp.array[int],
-    wall_friction: wp.array[float], dt: wp.array[float], clear: int,
-):  # fmt: skip
-    """One node of a block with the bodies `present[starts[b] : starts[b + 1]]`; `corners[b]` is its first node.
-
-    `clear`: forget the nearest particles, so that find_nearest follows.
-    """
+    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, blocks: TouchingBlocks, step: Substep
+):
+    """Contact at one node of a block."""
     b = wp.tid() // BLOCK_NODES
     n = wp.tid() % BLOCK_NODES
     stride_y = grid.nodes[2]
     stride_x = grid.nodes[1] * stride_y
-    i = corners[b] // stride_x + n // (BLOCK * BLOCK)
-    j = (corners[b] // stride_y) % grid.nodes[1] + (n // BLOCK) % BLOCK
-    k = corners[b] % stride_y + n % BLOCK
-    resolve_node(grid, rows, bodies, velocity, nearest, present, starts[b], starts[b + 1], i, j, k, wall_friction,
-                 dt[0], clear)  # fmt: skip
+    corner = blocks.corners[b]
+    i = corner // stride_x + n // (BLOCK * BLOCK)
+    j = (corner // stride_y) % grid.nodes[1] + (n // BLOCK) % BLOCK
+    k = corner % stride_y + n % BLOCK
+    present = blocks.present[blocks.starts[b] : blocks.starts[b + 1]]
+    resolve_node(grid, rows, bodies, nodes, present, wp.vec3i(i, j, k), step)

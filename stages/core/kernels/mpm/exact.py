@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from stages.core.kernels.mpm.nodes import GATHER, SCATTER, mat43, scatter_nodes
+from stages.core.kernels.mpm.grid import MpmGrid, Stencil
+from stages.core.kernels.mpm.nodes import GATHER, SCATTER, STENCIL, mat43, scatter_nodes
 
 _P2G = """
     typedef long long number;
@@ -42,19 +43,17 @@ _G2P = """
 """
 
 
-@wp.func_native(_P2G + SCATTER)
+@wp.func_native(STENCIL + _P2G + SCATTER)
 def scatter_exact(
-    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
-    affine: wp.mat44, scale: wp.vec2,
-):  # fmt: skip
+    grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, affine: wp.mat44, scale: wp.vec2
+):
     """P2G in fixed point; arguments as `scatter_nodes`, with the quanta `scale`."""
 
 
-@wp.func_native(_G2P + GATHER)
+@wp.func_native(STENCIL + _G2P + GATHER)
 def gather_exact(
-    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
-    scale: wp.vec2,
-) -> mat43:  # fmt: skip
+    grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, scale: wp.vec2
+) -> mat43:
     """G2P from momenta in fixed point, without a floor; result as `gather_nodes`."""
 
 
@@ -86,8 +85,7 @@ def velocity_from_exact(momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4]
 
 @wp.func
 def scatter_float(
-    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
-    affine: wp.mat44, scale: wp.vec2,
-):  # fmt: skip
+    grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, affine: wp.mat44, scale: wp.vec2
+):
     """scatter_nodes with the signature of scatter_exact."""
-    scatter_nodes(momentum, first, stride_x, stride_y, weight, fx, affine)
+    scatter_nodes(grid, momentum, stencil, weight, affine)

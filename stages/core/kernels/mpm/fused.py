@@ -20,14 +20,15 @@ from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, scatter_f
 from stages.core.kernels.mpm.grid import (
     BLOCK,
     MpmGrid,
-    Obstacle,
+    Stencil,
     apply_obstacles,
     apply_restitution,
     apply_walls,
     bspline_weights,
-    first_node,
+    empty_stencil,
     near_obstacles,
     near_walls,
+    stencil_at,
 )
 from stages.core.kernels.mpm.nodes import gather_momentum, mat43
 from stages.core.kernels.mpm.transfers import (
@@ -35,6 +36,7 @@ from stages.core.kernels.mpm.transfers import (
     LOST,
     ParticleArrays,
     ParticleUpdate,
+    Substep,
     advance_free,
     advance_kinematic,
     affine_momentum,
@@ -42,6 +44,17 @@ from stages.core.kernels.mpm.transfers import (
 )
 
 THREADS_PER_BLOCK = 128
+
+
+@wp.struct
+class RotatingNodes:
+    """Momentum and mass of the nodes of all scenes in the three grids of a substep; units as in NodeArrays."""
+
+    read: wp.array[wp.vec4]
+    write: wp.array[wp.vec4]
+    stale: wp.array[wp.vec4]  # to be cleared
+    scale: wp.vec2  # fixed-point units, see exact.py; 0 in floating point
+    friction: wp.array[float]  # Coulomb coefficient at floor and walls
 
 
 @wp.func
@@ -59,67 +72,52 @@ def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
 
 
 @wp.func
-def _node_velocity(
-    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], node: int, at: wp.vec3i, scale: wp.vec2
-) -> wp.vec3:
+def _node_velocity(grid: MpmGrid, nodes: RotatingNodes, node: int, at: wp.vec3i) -> wp.vec3:
     """Velocity of a node after the walls; the grid is in fixed point if `scale` is set (see `exact`)."""
     v = wp.vec3()
-    if scale[0] > 0.0:
-        v = velocity_exact(read, node, scale)
+    if nodes.scale[0] > 0.0:
+        v = velocity_exact(nodes.read, node, nodes.scale)
     else:
-        u = read[node]
+        u = nodes.read[node]
         v = wp.vec3(u[0], u[1], u[2]) / wp.max(u[3], 1e-30)
-    return apply_walls(grid, at, v, friction[node])
+    return apply_walls(grid, at, v, nodes.friction[node])
 
 
 @wp.func
-def _gather_walls(
-    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
-    scale: wp.vec2,
-) -> mat43:  # fmt: skip
+def _gather_walls(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
     """As gather_momentum, for stencils with nodes subject to walls."""
     s = mat43()
     for n in range(27):
-        at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
-        node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
-        s = _add(s, fx, n, _node_velocity(grid, read, friction, node, at, scale))
+        at = stencil.base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
+        node = stencil.first + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
+        s = _add(s, stencil.fx, n, _node_velocity(grid, nodes, node, at))
     return s
 
 
 @wp.func
-def _gather_obstacles(
-    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
-    corner: int, base: wp.vec3i, fx: wp.vec3, scale: wp.vec2,
-) -> mat43:  # fmt: skip
+def _gather_obstacles(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil, time: float) -> mat43:
     """As gather_momentum, for stencils with nodes subject to walls or obstacles."""
     s = mat43()
     for n in range(27):
-        at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
-        node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
-        v = _node_velocity(grid, read, friction, node, at, scale)
+        at = stencil.base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
+        node = stencil.first + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
+        v = _node_velocity(grid, nodes, node, at)
         place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-        s = _add(s, fx, n, apply_obstacles(place, v, obstacles, time, grid.dx))
+        s = _add(s, stencil.fx, n, apply_obstacles(place, v, grid.obstacles, time, grid.dx))
     return s
 
 
 @wp.func
-def _gather_free(
-    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
-    scale: wp.vec2,
-) -> mat43:  # fmt: skip
+def _gather_free(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
     """As gather_momentum, for stencils without nodes at walls, or at the floor only."""
-    under = grid.low[2] + 1 - base[2]
-    return gather_momentum(read, friction, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx),
-                           fx, under, grid.tangential_retention)  # fmt: skip
+    under = grid.low[2] + 1 - stencil.base[2]
+    return gather_momentum(grid, nodes.read, nodes.friction, stencil, bspline_weights(stencil.fx), under)
 
 
 @wp.func
-def _gather_free_exact(
-    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
-    scale: wp.vec2,
-) -> mat43:  # fmt: skip
+def _gather_free_exact(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
     """As _gather_free, from fixed point, for stencils without nodes at floor or walls."""
-    return gather_exact(read, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx), fx, scale)
+    return gather_exact(grid, nodes.read, stencil, bspline_weights(stencil.fx), nodes.scale)
 
 
 @wp.func
@@ -143,35 +141,26 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
 
     @wp.kernel(module="unique", enable_backward=False, **bounds)
     def fused_step(
-        grid: MpmGrid, rows: ParticleArrays, sweep_from: int, sweepers: int, gather: int, scatter: int, substep: int,
-        clock: wp.array[float], damping: float, read: wp.array[wp.vec4], write: wp.array[wp.vec4],
-        stale: wp.array[wp.vec4], friction: wp.array[float], active: ActiveBlocks, obstacles: wp.array[Obstacle],
-        scale: wp.vec2,
+        grid: MpmGrid, rows: ParticleArrays, nodes: RotatingNodes, active: ActiveBlocks, step: Substep, number: int
     ):  # fmt: skip
-        """Threads below `sweep_from` (a multiple of 32) each move a particle; `sweepers` more clear the grid `stale`.
-
-        `gather` and `scatter` switch G2P and P2G. clock: the substep [s], on the device, so that a captured graph can
-        be replayed with another value.
-        """
+        """Substep `number` of the frame, from 0. The first `sweepers` threads (a multiple of 32) each move a particle;
+        if these gather and scatter, as many more clear the grid `stale`."""
         i = wp.tid()
-        if i >= sweep_from:
-            if scatter > 0 and gather > 0:
-                nodes = active.total[0] * BLOCK * BLOCK * BLOCK
-                t = i - sweep_from
-                while t < nodes:
+        if i >= active.sweepers:
+            if step.scatter > 0 and step.gather > 0:
+                total = active.total[0] * BLOCK * BLOCK * BLOCK
+                t = i - active.sweepers
+                while t < total:
                     node = node_of_block(grid, active.blocks[t // 64], t % 64)
                     if wp.static(exact):
-                        stale[2 * node] = wp.vec4()
-                        stale[2 * node + 1] = wp.vec4()
+                        nodes.stale[2 * node] = wp.vec4()
+                        nodes.stale[2 * node + 1] = wp.vec4()
                     else:
-                        stale[node] = wp.vec4()
-                    t += sweepers
+                        nodes.stale[node] = wp.vec4()
+                    t += active.sweepers
             return
-        dt = clock[0]
-        stride_y = grid.nodes[2]
-        stride_x = grid.nodes[1] * grid.nodes[2]
-        first = int(-1)
-        fx = wp.vec3(1.0, 1.0, 1.0)
+        dt = step.dt
+        target = empty_stencil()
         load = wp.mat44()
         held = int(LOST)
         if i < rows.count:
@@ -182,60 +171,51 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
             F = rows.F[i]
             stiffness = rows.stiffness[i]
             window = rows.scene[i] * grid.count
-            if gather > 0 and held == FREE:
-                g = (x - grid.origin) / grid.dx
-                base = first_node(g)
-                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-                at = window + base[0] * stride_x + base[1] * stride_y + base[2]
+            if step.gather > 0 and held == FREE:
+                source = stencil_at(grid, x, window)
                 s = mat43()
                 if wp.static(has_obstacles):
-                    time = dt * float(substep)
-                    if walled(grid, base) or near_obstacles(x, obstacles, time, 2.0 * grid.dx):
-                        s = _gather_obstacles(grid, read, friction, obstacles, time, at, base, fx, scale)
+                    time = dt * float(number)
+                    if walled(grid, source.base) or near_obstacles(x, grid.obstacles, time, 2.0 * grid.dx):
+                        s = _gather_obstacles(grid, nodes, source, time)
                     else:
-                        s = collect(grid, read, friction, at, base, fx, scale)
+                        s = collect(grid, nodes, source)
                 else:
-                    if walled(grid, base):
-                        s = _gather_walls(grid, read, friction, at, base, fx, scale)
+                    if walled(grid, source.base):
+                        s = _gather_walls(grid, nodes, source)
                     else:
-                        s = collect(grid, read, friction, at, base, fx, scale)
+                        s = collect(grid, nodes, source)
                 now = advance_free(grid, x, F, s, dt)
             else:
-                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
+                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(step.gather > 0, dt, 0.0))
             if not now.alive:
                 mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
-            tau = wp.mat33()
             if wp.static(plastic):
                 new = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
-                                      wp.where(gather > 0, dt, 0.0))  # fmt: skip
+                                      wp.where(step.gather > 0, dt, 0.0))  # fmt: skip
                 now.F = new.F
-                tau = new.tau
+                now.tau = new.tau
                 rows.state[i] = new.state
             else:
-                tau = neo_hookean(now.F, stiffness)
-            if gather > 0:
+                now.tau = neo_hookean(now.F, stiffness)
+            if step.gather > 0:
                 rows.x[i] = now.x
                 rows.F[i] = now.F
-                if scatter == 0:  # during a frame the velocity is only on the grid
+                if step.scatter == 0:  # during a frame the velocity is only on the grid
                     rows.v[i] = now.v
                     rows.C[i] = now.C
-            if scatter > 0 and now.alive:
-                g = (now.x - grid.origin) / grid.dx
-                base = first_node(g)
-                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
+            if step.scatter > 0 and now.alive:
+                target = stencil_at(grid, now.x, window)
+                base = target.base
                 previous = rows.base_node[i]
                 if base[0] != previous[0] or base[1] != previous[1] or base[2] != previous[2]:
                     rows.base_node[i] = base
-                    activate_blocks(grid, rows, i, base, friction, active)
+                    activate_blocks(grid, rows, i, base, nodes.friction, active)
                 if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
-                        now.v = apply_restitution(
-                            grid, obstacles, dt * float(substep + 1), now.x, now.v, rows.friction[i], dt
-                        )
-                load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2],
-                                       rows.acceleration[i], held, dt, damping)  # fmt: skip
-                first = window + base[0] * stride_x + base[1] * stride_y + base[2]
-        if scatter > 0:
-            add(write, first, stride_x, stride_y, bspline_weights(fx), fx, load, scale)
+                        now.v = apply_restitution(grid, dt * float(number + 1), now.x, now.v, rows.friction[i], dt)
+                load = affine_momentum(grid, rows, i, now, held, dt)
+        if step.scatter > 0:
+            add(grid, nodes.write, target, bspline_weights(target.fx), load, nodes.scale)
 
     return fused_step

@@ -21,6 +21,21 @@ SEPARATE, SLIP, STICKY = 0, 1, 2  # contact conditions (Obstacle.surface): Coulo
 
 
 @wp.struct
+class Obstacle:
+    """Moving obstacle: the half-space below local z = 0, a sphere of radius size[0] [m], or a box (half edges)."""
+
+    kind: int
+    surface: int
+    centre: wp.vec3
+    turn: wp.quat  # rotation, local to world
+    size: wp.vec3
+    velocity: wp.vec3  # [m/s]
+    spin: wp.vec3  # angular velocity [rad/s]
+    friction: float
+    restitution: float
+
+
+@wp.struct
 class MpmGrid:
     """Grid of a scene: node (i, j, k) lies at origin + dx (i, j, k) [m] and has index (i ny + j) nz + k of `count`."""
 
@@ -35,21 +50,28 @@ class MpmGrid:
     face_high: wp.vec3
     spring: float  # circular frequency of the springs of surfaces with restitution [rad/s]
     tangential_retention: float  # fraction of the tangential velocity kept at a wall in each substep; < 0: Coulomb
+    damping: float  # fraction of the symmetric part of C removed in each transfer (RPIC), 0 to 1
+    obstacles: wp.array[Obstacle]  # of all scenes
 
 
 @wp.struct
-class Obstacle:
-    """Moving obstacle: the half-space below local z = 0, a sphere of radius size[0] [m], or a box (half edges)."""
+class NodeArrays:
+    """Nodes of the grids of all scenes."""
 
-    kind: int
-    surface: int
-    centre: wp.vec3
-    turn: wp.quat  # rotation, local to world
-    size: wp.vec3
-    velocity: wp.vec3  # [m/s]
-    spin: wp.vec3  # angular velocity [rad/s]
-    friction: float
-    restitution: float
+    velocity: wp.array[wp.vec4]  # [m/s], and mass [kg]
+    momentum: wp.array[wp.vec4]  # [kg m/s], and mass [kg]; one or more copies, or in fixed point two rows a node
+    scale: wp.vec2  # fixed-point units of momentum and mass, see exact.py; 0 in floating point
+    friction: wp.array[float]  # Coulomb coefficient at floor and walls
+    nearest: wp.array[wp.int64]  # key of the nearest particle of each body in contact, see contact.py
+
+
+@wp.struct
+class Stencil:
+    """The 3 x 3 x 3 nodes that a particle exchanges with."""
+
+    first: int  # index of the first node over all scenes; < 0: none
+    base: wp.vec3i  # the same along x, y and z in the grid of the scene
+    fx: wp.vec3  # distance of the particle from it [cells], in [0.5, 1.5)^3
 
 
 @wp.func
@@ -81,6 +103,27 @@ def first_node(g: wp.vec3) -> wp.vec3i:
 
 
 @wp.func
+def stencil_at(grid: MpmGrid, x: wp.vec3, window: int) -> Stencil:
+    """Stencil of a particle at x [m], in the grid whose first node is `window`."""
+    g = (x - grid.origin) / grid.dx
+    base = first_node(g)
+    out = Stencil()
+    out.base = base
+    out.fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
+    out.first = window + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
+    return out
+
+
+@wp.func
+def empty_stencil() -> Stencil:
+    """Stencil of a thread without a particle: no nodes."""
+    out = Stencil()
+    out.first = -1
+    out.fx = wp.vec3(1.0, 1.0, 1.0)
+    return out
+
+
+@wp.func
 def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
     """Velocity after contact with a surface of unit outward `normal`: no inward component, Coulomb friction.
 
@@ -97,14 +140,15 @@ def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
 
 
 @wp.func
-def _spring(
-    v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, grid: MpmGrid, dt: float
-) -> wp.vec3:
-    """Velocity of a particle after `dt` under a surface's penalty spring and friction; depth from REST_DISTANCE [m]."""
+def _spring(v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, rate: float) -> wp.vec3:
+    """Velocity of a particle after a substep under a surface's penalty spring and friction.
+
+    depth: from REST_DISTANCE [m]; rate: velocity gained per depth [1/s].
+    """
     if depth <= 0.0:
         return v
     across = wp.dot(v, normal)
-    gain = dt * grid.spring * grid.spring * depth * wp.where(across > 0.0, restitution * restitution, 1.0)
+    gain = rate * depth * wp.where(across > 0.0, restitution * restitution, 1.0)
     along = v - across * normal
     speed = wp.length(along)
     left = wp.where(speed > friction * gain, 1.0 - friction * gain / wp.max(speed, 1e-12), 0.0)
@@ -223,45 +267,43 @@ def apply_obstacles(
 
 @wp.func
 def apply_restitution(
-    grid: MpmGrid, obstacles: wp.array[Obstacle], time: float, x: wp.vec3, velocity: wp.vec3, friction: float, dt: float
-) -> wp.vec3:
+    grid: MpmGrid, time: float, x: wp.vec3, velocity: wp.vec3, friction: float, dt: float
+) -> wp.vec3:  # fmt: skip
     """Velocity of a particle after `dt` [s] under the springs of all walls and obstacles with restitution."""
     v = velocity
+    rate = dt * grid.spring * grid.spring
     touch = REST_DISTANCE * grid.dx
     if grid.restitution > 0.0:
         for axis in range(3):
             normal = wp.vec3()
             normal[axis] = 1.0
-            v = _spring(v, normal, grid.face_low[axis] + touch - x[axis], friction, grid.restitution, grid, dt)
-            v = _spring(v, -normal, x[axis] - grid.face_high[axis] + touch, friction, grid.restitution, grid, dt)
-    for n in range(obstacles.shape[0]):
-        o = obstacles[n]
+            v = _spring(v, normal, grid.face_low[axis] + touch - x[axis], friction, grid.restitution, rate)
+            v = _spring(v, -normal, x[axis] - grid.face_high[axis] + touch, friction, grid.restitution, rate)
+    for n in range(grid.obstacles.shape[0]):
+        o = grid.obstacles[n]
         if o.restitution > 0.0:
             out = _surface_at(o, x, time)
             moving = o.velocity + wp.cross(o.spin, x - o.centre - time * o.velocity)
             normal = wp.vec3(out[0], out[1], out[2])
-            v = moving + _spring(v - moving, normal, touch - out[3], o.friction, o.restitution, grid, dt)
+            v = moving + _spring(v - moving, normal, touch - out[3], o.friction, o.restitution, rate)
     return v
 
 
 @wp.func
-def apply_boundaries(
-    grid: MpmGrid, velocity: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
-    first: int, at: wp.vec3i,
-):  # fmt: skip
+def apply_boundaries(grid: MpmGrid, nodes: NodeArrays, time: float, first: int, at: wp.vec3i):
     """Apply walls and obstacles to the velocities of a row of four nodes, the first of which is `at`."""
     inside = at[0] > grid.low[0] and at[0] < grid.high[0] and at[1] > grid.low[1] and at[1] < grid.high[1]
     inside = inside and at[2] > grid.low[2] and at[2] + BLOCK <= grid.high[2]
     blocked = bool(False)
-    if obstacles.shape[0] > 0:
+    if grid.obstacles.shape[0] > 0:
         middle = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]) + 1.5)
-        blocked = near_obstacles(middle, obstacles, time, 2.0 * grid.dx)
+        blocked = near_obstacles(middle, grid.obstacles, time, 2.0 * grid.dx)
     if inside and not blocked:
         return
     for n in range(BLOCK):
-        u = velocity[first + n]
-        v = apply_walls(grid, at + wp.vec3i(0, 0, n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
+        u = nodes.velocity[first + n]
+        v = apply_walls(grid, at + wp.vec3i(0, 0, n), wp.vec3(u[0], u[1], u[2]), nodes.friction[first + n])
         if blocked:
             place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2] + n))
-            v = apply_obstacles(place, v, obstacles, time, grid.dx)
-        velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
+            v = apply_obstacles(place, v, grid.obstacles, time, grid.dx)
+        nodes.velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])

@@ -2,15 +2,22 @@
 
 A node is four floats: x, y, z of velocity or momentum, and mass. On the CPU a row of four nodes along z is one 16-lane
 SIMD vector, of which three nodes have non-zero weight. On CUDA a node is one 16-byte load or one vector atomic.
-`first` is the index of the stencil's first node, stride_x and stride_y are in nodes, `weight` and `fx` as in
-`grid.bspline_weights`.
+`weight` are the `grid.bspline_weights` of the stencil.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from stages.core.kernels.mpm.grid import MpmGrid, Stencil
+
 mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
+
+# The index of the stencil's first node, the strides [nodes], and the distance of the particle from that node [cells].
+STENCIL = """
+    const int first = stencil.first, stride_y = grid.nodes.c[2], stride_x = grid.nodes.c[1] * stride_y;
+    const wp::vec3 fx = stencil.fx;
+"""
 
 # P2G node by node. `value_of` gives what is added to number n of a node; `add` does so atomically, on CUDA only, where
 # consecutive lanes whose particles share a cell (a run) are summed before: lane l sums lanes l to l + 7 of its run, and
@@ -128,34 +135,7 @@ _P2G = """
     };
 """
 
-_G2P_OF_MOMENTUM = """
-    // Divides by mass at each node, and applies the floor condition of grid.apply_walls to the lowest `under` layers of
-    // the stencil.
-    const float* base = (const float*)(momentum.data + first);
-    const auto weigh = [&](const float* node, int i, int j, int k, float* u) {
-        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
-#if defined(__CUDA_ARCH__)
-        const float4 q = *(const float4*)node;
-        const float m = __fdividef(w, fmaxf(q.w, 1e-30f));
-        u[0] = m * q.x; u[1] = m * q.y; u[2] = m * q.z;
-#else
-        const float m = w / (node[3] > 1e-30f ? node[3] : 1e-30f);
-        for (int n = 0; n < 3; ++n) u[n] = m * node[n];
-#endif
-        if (k < under && u[2] < 0.0f) {
-            float left = keep;
-            if (keep < 0.0f) {
-                const float speed = sqrtf(u[0] * u[0] + u[1] * u[1]);
-                const float stop = -friction.data[first + i * stride_x + j * stride_y + k] * u[2];
-                left = speed > stop ? 1.0f - stop / speed : 0.0f;
-            }
-            u[0] *= left; u[1] *= left; u[2] = 0.0f;
-        }
-    };
-"""
-
-
-@wp.func_native("""
+_G2P = """
     // Grid to particle (G2P) from node velocities: row 0 of the result is sum w v, rows 1 to 3 are sum w v d with the
     // offset d of the node from the particle along x, y, z [cells].
     wp::mat_t<4, 3, wp::float32> out;
@@ -206,18 +186,43 @@ _G2P_OF_MOMENTUM = """
     }
 #endif
     return out;
-""")
-def gather_nodes(
-    velocity: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3
-) -> mat43:
+"""
+
+_G2P_OF_MOMENTUM = """
+    // Divides by mass at each node, and applies the floor condition of grid.apply_walls to the lowest `under` layers of
+    // the stencil.
+    const float* base = (const float*)(momentum.data + first);
+    const float keep = grid.tangential_retention;
+    const auto weigh = [&](const float* node, int i, int j, int k, float* u) {
+        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
+#if defined(__CUDA_ARCH__)
+        const float4 q = *(const float4*)node;
+        const float m = __fdividef(w, fmaxf(q.w, 1e-30f));
+        u[0] = m * q.x; u[1] = m * q.y; u[2] = m * q.z;
+#else
+        const float m = w / (node[3] > 1e-30f ? node[3] : 1e-30f);
+        for (int n = 0; n < 3; ++n) u[n] = m * node[n];
+#endif
+        if (k < under && u[2] < 0.0f) {
+            float left = keep;
+            if (keep < 0.0f) {
+                const float speed = sqrtf(u[0] * u[0] + u[1] * u[1]);
+                const float stop = -friction.data[first + i * stride_x + j * stride_y + k] * u[2];
+                left = speed > stop ? 1.0f - stop / speed : 0.0f;
+            }
+            u[0] *= left; u[1] *= left; u[2] = 0.0f;
+        }
+    };
+"""
+
+
+@wp.func_native(STENCIL + _G2P)
+def gather_nodes(grid: MpmGrid, velocity: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33) -> mat43:
     """G2P from node velocities: sums (4, 3) over the stencil of w v and of w v x offset [cells]."""
 
 
-@wp.func_native(_P2G + SCATTER + "#endif\n")
-def scatter_nodes(
-    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
-    affine: wp.mat44,
-):  # fmt: skip
+@wp.func_native(STENCIL + _P2G + SCATTER + "#endif\n")
+def scatter_nodes(grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, affine: wp.mat44):
     """P2G: add a particle's momentum and mass, which vary affinely over the stencil, to its nodes."""
 
 
@@ -256,9 +261,9 @@ def velocity_from_momentum(
     """
 
 
-@wp.func_native(_G2P_OF_MOMENTUM + GATHER)
+@wp.func_native(STENCIL + _G2P_OF_MOMENTUM + GATHER)
 def gather_momentum(
-    momentum: wp.array[wp.vec4], friction: wp.array[float], first: int, stride_x: int, stride_y: int, weight: wp.mat33,
-    fx: wp.vec3, under: int, keep: float,
+    grid: MpmGrid, momentum: wp.array[wp.vec4], friction: wp.array[float], stencil: Stencil, weight: wp.mat33,
+    under: int,
 ) -> mat43:  # fmt: skip
     """G2P from node momenta, with the floor condition on the lowest `under` layers of the stencil."""

@@ -18,12 +18,14 @@ from stages.core.kernels.mpm.exact import scatter_exact, scatter_float
 from stages.core.kernels.mpm.grid import (
     BLOCK,
     MpmGrid,
-    Obstacle,
+    NodeArrays,
     apply_boundaries,
     apply_restitution,
     bspline_weights,
+    empty_stencil,
     first_node,
     near_walls,
+    stencil_at,
 )
 from stages.core.kernels.mpm.nodes import gather_nodes, velocity_from_momentum
 from stages.core.kernels.mpm.transfers import (
@@ -31,6 +33,7 @@ from stages.core.kernels.mpm.transfers import (
     LOST,
     ParticleArrays,
     ParticleUpdate,
+    Substep,
     advance_free,
     advance_kinematic,
     affine_momentum,
@@ -38,31 +41,34 @@ from stages.core.kernels.mpm.transfers import (
 )
 
 
+@wp.struct
+class ParticlePart:
+    """Particles start to stop - 1, and the copy of the momentum that they are scattered into."""
+
+    start: int
+    stop: int
+    copy: int  # its first node
+
+
 @cache
 def particle_step(plastic: bool, restitution: bool, exact: bool = False) -> wp.Kernel:
     """Build the particle kernel; `plastic`: with material models other than neo-Hookean.
 
-    `exact`: it scatters in fixed point, with the quanta `scale`, and lists active blocks instead of setting `stale`.
+    `exact`: it scatters in fixed point, and lists active blocks instead of setting `stale`.
     """
     add = scatter_exact if exact else scatter_float
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_step(
-        grid: MpmGrid, rows: ParticleArrays, start: int, stop: int, gather: int, scatter: int, dt: float,
-        damping: float, velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
-        obstacles: wp.array[Obstacle], clock: wp.array[float], scale: wp.vec2, friction: wp.array[float],
-        active: ActiveBlocks,
+        grid: MpmGrid, rows: ParticleArrays, part: ParticlePart, nodes: NodeArrays, active: ActiveBlocks, step: Substep
     ):  # fmt: skip
-        """Particles start + tid. `gather` and `scatter` switch G2P and P2G; `copy` is the first node of the momentum
-        copy to scatter into; `stale` is set when a particle moved beyond the marked blocks."""
-        i = start + wp.tid()
-        stride_y = grid.nodes[2]
-        stride_x = grid.nodes[1] * grid.nodes[2]
-        first = int(-1)
-        fx = wp.vec3(1.0, 1.0, 1.0)
+        """One particle of a part."""
+        i = part.start + wp.tid()
+        dt = step.dt
+        target = empty_stencil()
         load = wp.mat44()
         held = int(LOST)
-        if i < stop:
+        if i < part.stop:
             held = int(rows.held[i])
         if held != LOST:
             now = ParticleUpdate()
@@ -70,64 +76,54 @@ def particle_step(plastic: bool, restitution: bool, exact: bool = False) -> wp.K
             F = rows.F[i]
             stiffness = rows.stiffness[i]
             window = rows.scene[i] * grid.count
-            if gather > 0 and held == FREE:
-                g = (x - grid.origin) / grid.dx
-                base = first_node(g)
-                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-                at = window + base[0] * stride_x + base[1] * stride_y + base[2]
-                sums = gather_nodes(velocity, at, stride_x, stride_y, bspline_weights(fx), fx)
+            if step.gather > 0 and held == FREE:
+                source = stencil_at(grid, x, window)
+                sums = gather_nodes(grid, nodes.velocity, source, bspline_weights(source.fx))
                 now = advance_free(grid, x, F, sums, dt)
             else:
-                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
+                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(step.gather > 0, dt, 0.0))
             if not now.alive:
                 mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
-            tau = wp.mat33()
             if wp.static(plastic):
                 new = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
-                                      wp.where(gather > 0, dt, 0.0))  # fmt: skip
+                                      wp.where(step.gather > 0, dt, 0.0))  # fmt: skip
                 now.F = new.F
-                tau = new.tau
+                now.tau = new.tau
                 rows.state[i] = new.state
             else:
-                tau = neo_hookean(now.F, stiffness)
-            if gather > 0:
+                now.tau = neo_hookean(now.F, stiffness)
+            if step.gather > 0:
                 rows.x[i] = now.x
                 rows.v[i] = now.v
                 rows.C[i] = now.C
                 rows.F[i] = now.F
-            if scatter > 0 and now.alive:
-                g = (now.x - grid.origin) / grid.dx
-                base = first_node(g)
-                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
+            if step.scatter > 0 and now.alive:
+                target = stencil_at(grid, now.x, part.copy + window)
+                base = target.base
                 previous = rows.base_node[i]
                 shift = wp.max(wp.abs(base[0] - previous[0]), wp.abs(base[1] - previous[1]))
                 shift = wp.max(shift, wp.abs(base[2] - previous[2]))
                 if wp.static(exact):
                     if shift > 0:
                         rows.base_node[i] = base
-                        activate_blocks(grid, rows, i, base, friction, active)
+                        activate_blocks(grid, rows, i, base, nodes.friction, active)
                 elif shift > 1:
-                    stale[0] = 1
+                    active.stale[0] = 1
                 if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
-                        now.v = apply_restitution(grid, obstacles, clock[0] + dt, now.x, now.v, rows.friction[i], dt)
-                load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2],
-                                       rows.acceleration[i], held, dt, damping)  # fmt: skip
-                first = copy + window + base[0] * stride_x + base[1] * stride_y + base[2]
-        if scatter > 0:
-            add(momentum, first, stride_x, stride_y, bspline_weights(fx), fx, load, scale)
+                        now.v = apply_restitution(grid, step.clock[0] + dt, now.x, now.v, rows.friction[i], dt)
+                load = affine_momentum(grid, rows, i, now, held, dt)
+        if step.scatter > 0:
+            add(grid, nodes.momentum, target, bspline_weights(target.fx), load, nodes.scale)
 
     return particle_step
 
 
 @wp.kernel(enable_backward=False)
-def grid_step(
-    grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
-    blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int,
-):  # fmt: skip
+def grid_step(grid: MpmGrid, start: int, nodes: NodeArrays, blocks: wp.array[wp.vec2i], clock: wp.array[float]):
     """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
 
-    clock: time since the start of the frame [s], for moving obstacles.
+    clock: as in Substep.
     """
     t = start + wp.tid()
     block = blocks[t // (BLOCK * BLOCK)]
@@ -140,8 +136,8 @@ def grid_step(
     j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
     k = corner % stride_y
     first = window + i * stride_x + j * stride_y + k
-    velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
-    apply_boundaries(grid, velocity, friction, obstacles, clock[0], first, wp.vec3i(i, j, k))
+    velocity_from_momentum(nodes.momentum, nodes.velocity, first, nodes.velocity.shape[0], block[1])
+    apply_boundaries(grid, nodes, clock[0], first, wp.vec3i(i, j, k))
 
 
 @wp.kernel(enable_backward=False)

@@ -58,7 +58,26 @@ class ParticleUpdate:
     v: wp.vec3
     C: wp.mat33
     F: wp.mat33
+    tau: wp.mat33  # Kirchhoff stress without that of damping [Pa]
     alive: bool
+
+
+@wp.struct
+class Substep:
+    """A substep, and what is done in it."""
+
+    dt: float  # [s]
+    clock: wp.array[float]  # time since the start of the frame [s], for moving obstacles; not in the fused order
+    gather: int  # 1: particles gather velocities from the grid (G2P) and move
+    scatter: int  # 1: particles scatter momentum and stress (P2G) for the next substep
+    forget: int  # 1: nodes forget their nearest particles, so that find_nearest follows
+
+
+def substep(dt: float, gather: int = 0, scatter: int = 0, clock: wp.array | None = None, forget: int = 0) -> Substep:
+    """The struct with these values."""
+    step = Substep()
+    step.dt, step.gather, step.scatter, step.clock, step.forget = dt, gather, scatter, clock, forget
+    return step
 
 
 @wp.func
@@ -110,17 +129,17 @@ def mark_lost(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, 
 
 @wp.func
 def affine_momentum(
-    dx: float, now: ParticleUpdate, tau: wp.mat33, mass: float, volume: float, viscosity: float,
-    acceleration: wp.vec3, held: int, dt: float, damping: float,
+    grid: MpmGrid, rows: ParticleArrays, i: int, now: ParticleUpdate, held: int, dt: float
 ) -> wp.mat44:  # fmt: skip
-    """P2G contribution of a particle: row 0 momentum and mass, rows 1 to 3 their change per cell along x, y, z.
+    """P2G contribution of particle i: row 0 momentum and mass, rows 1 to 3 their change per cell along x, y, z.
 
-    APIC momentum with RPIC damping, and the MLS-MPM stress impulse of Kirchhoff stress `tau` and viscosity.
+    APIC momentum with RPIC damping, and the MLS-MPM stress impulse in `dt` [s].
     """
+    m = rows.mass[i]
     both = now.C + wp.transpose(now.C)
-    A = (dx * mass) * (now.C - (0.5 * damping) * both) - (dt * 4.0 / dx * volume) * (tau + viscosity * both)
-    m = mass
-    q = m * (now.v + dt * acceleration)
+    tau = now.tau + rows.stiffness[i][2] * both  # read again: it would take a register since the stress
+    A = (grid.dx * m) * (now.C - (0.5 * grid.damping) * both) - (dt * 4.0 / grid.dx * rows.volume[i]) * tau
+    q = m * (now.v + dt * rows.acceleration[i])
     if held != FREE:
         m = wp.where(held == PINNED, 0.0, m * KINEMATIC_MASS_FACTOR)
         q = m * now.v

@@ -83,6 +83,7 @@ class BodyContact:
             "origin": (np.array([s.origin for s in shapes], np.float32), wp.vec3),
             "spacing": (np.array([s.spacing for s in shapes], np.float32), None),
             "friction": (friction.float().cpu().numpy(), None),
+            "all": (np.arange(len(shapes), dtype=np.int32), None),
         }
         self.bodies, self._tensors = ContactBodies(), {}
         for name, (values, kind) in columns.items():

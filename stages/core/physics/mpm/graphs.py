@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from stages.core.kernels.cuda_graphs import captured
-from stages.core.kernels.interop import launch, view
+from stages.core.kernels.interop import launch, view, with_arrays
 from stages.core.kernels.mpm.active import ActiveBlocks, clear_active_blocks
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.particle_rows import ParticleRows
@@ -25,23 +25,20 @@ MAX_GRAPHS = 24  # CUDA graphs kept, one per number of substeps
 class GraphedFrames(ABC):
     """Runs the substeps of a frame for the particles in `rows`; parameters as in SplitSubsteps."""
 
-    def __init__(self, rows: ParticleRows, damping: float, obstacles: wp.array, scale: tuple[float, float] | None):
+    def __init__(self, rows: ParticleRows, scale: tuple[float, float] | None):
         """`scale`: fixed-point units of momentum and mass for exact sums, see core/kernels/mpm/exact.py."""
-        self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
-        self._obstacles = obstacles
+        self.rows, self.grid, self.device = rows, rows.grid, rows.device
         self._count = rows.scenes * self.grid.count
         self._width, self._scale = (1, wp.vec2()) if scale is None else (2, wp.vec2(*scale))
         self._friction = torch.zeros(self._count, device=self.device)
         ints = {"dtype": torch.int32, "device": self.device}
         self._marks = torch.zeros(self._count // BLOCK**3, **ints)
         self._blocks, self._total = torch.zeros_like(self._marks), torch.zeros(1, **ints)
-        self._active = ActiveBlocks()
-        self._active.marks, self._active.blocks = view(self._marks), view(self._blocks)
-        self._active.total = view(self._total)
         self._sharers = torch.zeros(self.grid.count // BLOCK**3, **ints)
-        self._active.sharers = view(self._sharers)
+        columns = {"marks": self._marks, "blocks": self._blocks, "total": self._total, "sharers": self._sharers}
+        self._active = with_arrays(ActiveBlocks(), columns)
+        self._active.sweepers = -(-len(rows) // CLEAR_ALIGNMENT) * CLEAR_ALIGNMENT
         self._last_total = torch.zeros(1, **ints)
-        self._sweepers = -(-len(rows) // CLEAR_ALIGNMENT) * CLEAR_ALIGNMENT
         self._graphs: dict[tuple[float, int], torch.cuda.CUDAGraph | None] = {}
         self._pool = torch.cuda.graph_pool_handle() if self.device != "cpu" else None
 
@@ -82,7 +79,6 @@ class GraphedFrames(ABC):
         self._last_total.copy_(self._total)
         grids = self._grids()
         a, b, c = (view(grids[min(k, len(grids) - 1)], wp.vec4) for k in range(3))
-        width = a.size // self._count
-        inputs = [self.grid, self._sweepers, a, b, c, view(self._friction), self._active, width]
-        launch(clear_active_blocks, self._sweepers, inputs, device=self.device)
+        inputs = [self.grid, a, b, c, view(self._friction), self._active]
+        launch(clear_active_blocks, self._active.sweepers, inputs, device=self.device)
         self._total.zero_()

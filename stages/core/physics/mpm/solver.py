@@ -188,12 +188,12 @@ class Solver:
         columns = {f.name: getattr(particles, f.name) for f in fields(Particles)}
         self.rows = ParticleRows(columns, sizes, self.grid, device)
         self.colliders = options.colliders
-        self._obstacles = as_obstacles(self.colliders, device)
+        self.grid.damping, self.grid.obstacles = options.damping, as_obstacles(self.colliders, device)
         self._rates = self._max_rates()
         self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
         plastic = bool((particles.model != NEO_HOOKEAN).any())
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
-        shared = self.rows, plastic, bouncy, options.damping, self._obstacles
+        shared = self.rows, plastic, bouncy
         quanta = self._quanta() if exact else None
         contact = self._body_contact(particles, sizes, shapes) if schedule == "contact" else None
         if fused:
@@ -258,7 +258,7 @@ class Solver:
         self._substepper.frame(duration / substeps, substeps)
         if self.colliders:
             self.colliders = tuple(c.advanced(duration) for c in self.colliders)
-            self._obstacles.assign(as_obstacles(self.colliders, "cpu"))
+            self.grid.obstacles.assign(as_obstacles(self.colliders, "cpu"))
 
     @property
     def lost(self) -> Int[Tensor, "s"]:

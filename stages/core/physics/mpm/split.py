@@ -12,11 +12,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.interop import launch, view
+from stages.core.kernels.interop import launch, view, with_arrays
 from stages.core.kernels.mpm import split as kernels
 from stages.core.kernels.mpm.active import ActiveBlocks
-from stages.core.kernels.mpm.contact import NONE, REFRESH, STATIC_REACH, contact_step, find_nearest
+from stages.core.kernels.mpm.contact import NONE, REFRESH, STATIC_REACH, TouchingBlocks, contact_step, find_nearest
+from stages.core.kernels.mpm.grid import NodeArrays
 from stages.core.kernels.mpm.pins import pin_nodes
+from stages.core.kernels.mpm.transfers import substep
 from stages.core.kernels.threads import run_parallel
 from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.particle_rows import ParticleRows
@@ -30,20 +32,16 @@ MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch i
 class SplitSubsteps:
     """Runs the substeps of a frame for the particles in `rows`.
 
-    `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces;
-    `damping` as in Solver; `obstacles` are the colliders as kernels read them. With `contact` the scenes of `rows` are
-    bodies in contact with each other.
+    `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces. With
+    `contact` the scenes of `rows` are bodies in contact with each other.
     """
 
-    def __init__(
-        self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
-        contact: BodyContact | None = None,
-    ):  # fmt: skip
+    def __init__(self, rows: ParticleRows, plastic: bool, bouncy: bool, contact: BodyContact | None = None):
         self._contact, self._contact_commands, self._refresh = contact, [], True
         self._pins, self._pin_commands = None, []
-        self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
+        self.rows, self.grid, self.device = rows, rows.grid, rows.device
         self.parts = CPU_PARTS if self.device == "cpu" else 1
-        self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
+        self._step = kernels.particle_step(plastic, bouncy)
         self._count = rows.scenes * self.grid.count
         self._velocity = _lazy_zeros((self._count, 4), self.device)
         self._momentum = _lazy_zeros((self.parts * self._count, 4), self.device)
@@ -52,9 +50,12 @@ class SplitSubsteps:
         self._marks = torch.zeros(rows.scenes, *shape, dtype=torch.int32, device=self.device)
         self._stale = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._clock = torch.zeros(1, device=self.device)
-        self._dt = torch.zeros(1, device=self.device)
         keys = self._count if contact is not None else 0
         self._nearest = torch.full((keys,), int(NONE), dtype=torch.int64, device=self.device)
+        columns = {"velocity": self._velocity, "momentum": self._momentum, "friction": self._friction}
+        self._nodes = with_arrays(NodeArrays(), columns)
+        self._nodes.nearest = view(self._nearest)  # with_arrays would take it as 32-bit numbers
+        self._active = with_arrays(ActiveBlocks(), {"stale": self._stale})
         self._blocks = torch.zeros(0, 2, dtype=torch.int32, device=self.device)
 
     def frame(self, dt: float, steps: int) -> None:
@@ -62,14 +63,14 @@ class SplitSubsteps:
         self._clear_friction()
         self.rows.sort()
         self._clock.fill_(-dt)
-        self._dt.fill_(dt)
-        self._run(self._particles(dt, gather=0, scatter=1))
-        self._list_blocks()
-        between, last = self._particles(dt, 1, 1), self._particles(dt, 1, 0)
+        clock = view(self._clock)
+        self._run(self._particles(substep(dt, 0, 1, clock)))
+        self._list_blocks(dt)
+        between, last = (self._particles(substep(dt, 1, scatter, clock)) for scatter in (1, 0))
         for step in range(steps):
             if int(self._stale[0]):
                 self._nearest.fill_(int(NONE))
-                self._list_blocks()
+                self._list_blocks(dt)
             self._clock.fill_(step * dt)
             self._run(self._grid_commands)
             self._run(self._pin_commands)
@@ -79,7 +80,7 @@ class SplitSubsteps:
     def pin(self, pins: Pins) -> None:
         """Let these pins act from the next frame on."""
         self._pins = pins  # whose memory the launch reads
-        inputs = [pins.nodes, view(self._velocity, wp.vec4)]
+        inputs = [pins.nodes, self._nodes.velocity]
         self._pin_commands = [self._record(pin_nodes, pins.count, inputs)] if pins.count else []
 
     @property
@@ -87,18 +88,17 @@ class SplitSubsteps:
         """Number of active grid blocks, which are read, written and cleared in every substep."""
         return len(self._blocks)
 
-    def _particles(self, dt: float, gather: int, scatter: int) -> list[wp.Launch]:
-        # wp.Launch holds these views, which hold the tensors
-        grids = view(self._velocity, wp.vec4), view(self._momentum, wp.vec4)
-        return [
-            self._record(self._step, -(-(stop - start) // LAUNCH_MULTIPLE) * LAUNCH_MULTIPLE,
-                         [self.grid, self.rows.struct, start, stop, gather, scatter, dt, self.damping, *grids,
-                          part * self._count, view(self._stale), self._obstacles, view(self._clock), wp.vec2(),
-                          view(self._friction), ActiveBlocks()])
-            for part, (start, stop) in enumerate(self._ranges(len(self.rows)))
-        ]  # fmt: skip
+    def _particles(self, step) -> list[wp.Launch]:
+        commands = []
+        for n, (start, stop) in enumerate(self._ranges(len(self.rows))):
+            part = kernels.ParticlePart()
+            part.start, part.stop, part.copy = start, stop, n * self._count
+            inputs = [self.grid, self.rows.struct, part, self._nodes, self._active, step]
+            threads = -(-(stop - start) // LAUNCH_MULTIPLE) * LAUNCH_MULTIPLE
+            commands.append(self._record(self._step, threads, inputs))
+        return commands
 
-    def _list_blocks(self) -> None:
+    def _list_blocks(self, dt: float) -> None:
         """List the active blocks with the momentum copies each needs, and mark friction at floor and walls."""
         self._marks.zero_()
         self._stale.zero_()
@@ -111,8 +111,7 @@ class SplitSubsteps:
         self._blocks = torch.stack([first, self._marks[tuple(at.T)]], 1).int().contiguous()
         launch(kernels.mark_friction, len(self.rows), [self.grid, self.rows.struct, view(self._friction)],
                device=self.device)  # fmt: skip
-        inputs = [view(self._momentum, wp.vec4), view(self._velocity, wp.vec4), view(self._friction),
-                  view(self._blocks, wp.vec2i), self._obstacles, view(self._clock), self.rows.scenes]  # fmt: skip
+        inputs = [self._nodes, view(self._blocks, wp.vec2i), view(self._clock)]
         rows = len(at) * B * B
         ranges = self._ranges(rows) if rows > MIN_SPLIT_ROWS else [(0, rows)]
         self._grid_commands = [
@@ -120,7 +119,7 @@ class SplitSubsteps:
             for start, stop in ranges if stop > start  # nothing to do when all particles are lost
         ]  # fmt: skip
         if self._contact is not None:
-            self._contact_commands = self._contact_launches(at[:, 0].int(), first - at[:, 0] * self.grid.count)
+            self._contact_commands = self._contact_launches(dt, at[:, 0].int(), first - at[:, 0] * self.grid.count)
 
     def _contact_step(self, step: int, last: bool) -> None:
         if self._contact_commands:
@@ -130,7 +129,7 @@ class SplitSubsteps:
             self._run([clear if last or (step + 1) % REFRESH == 0 else keep])
         self._refresh = False
 
-    def _contact_launches(self, body: Tensor, corner: Tensor) -> list[wp.Launch]:
+    def _contact_launches(self, dt: float, body: Tensor, corner: Tensor) -> list[wp.Launch]:
         """The launches for contact; `body` has an active block, whose first node is `corner`."""
         self._refresh = True
         self._sharers = (self._marks > 0).sum(0, dtype=torch.int32).contiguous()
@@ -143,14 +142,14 @@ class SplitSubsteps:
         mine = mine[block[mine].argsort(stable=True)]
         corners, count = corners[touch].int(), count[touch]
         starts = torch.cat([torch.zeros(1, dtype=torch.int64, device=count.device), count.cumsum(0)]).int()
-        self._touching = corners.contiguous(), starts.contiguous(), body[mine].contiguous()
-        near = [self.grid, self.rows.struct, view(self._sharers.flatten()), view(self._nearest)]
-        inputs = [self.grid, self.rows.struct, self._contact.bodies, view(self._velocity, wp.vec4),
-                  view(self._nearest), *map(view, self._touching), view(self._friction), view(self._dt)]  # fmt: skip
+        blocks = {"corners": corners, "starts": starts, "present": body[mine]}
+        self._touching = with_arrays(TouchingBlocks(), blocks)  # whose memory the launches read
+        near = [self.grid, self.rows.struct, view(self._sharers.flatten()), self._nodes.nearest]
+        inputs = [self.grid, self.rows.struct, self._contact.bodies, self._nodes, self._touching]
         nodes = len(corners) * kernels.BLOCK**3
         return [
             self._record(find_nearest, len(self.rows), near),
-            *(self._record(contact_step, nodes, [*inputs, clear]) for clear in (0, 1)),
+            *(self._record(contact_step, nodes, [*inputs, substep(dt, forget=n)]) for n in (0, 1)),
         ]
 
     def _clear_friction(self) -> None:

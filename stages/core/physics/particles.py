@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,6 +51,14 @@ class Bodies:
     spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
 
 
+class SurfaceCloud(NamedTuple):
+    """Points of an object's surface, and where it may be closed."""
+
+    points: np.ndarray  # (n, 3)
+    gap: float  # between points, which is closed
+    others: np.ndarray | None  # (k, 3) points of other objects, where its unseen sides are missing
+
+
 @cached_in_scene
 def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -> Bodies:
     """Sample about `count` particles for all objects together, in bounded time and memory.
@@ -59,16 +68,14 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
     Raises InputError for an object without any usable Gaussian.
     """
-    clouds, gaps = zip(*parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects), strict=True)
-    others = [_others(scene, o.id) for o in scene.objects]
-    photographed = scene.cameras is not None  # so the objects were at rest
-    extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
+    found = parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects)
+    clouds = [SurfaceCloud(*row, _others(scene, o.id)) for row, o in zip(found, scene.objects, strict=True)]
+    extent = max(float((c.points.max(0) - c.points.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
-    finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
+    finest = max(extent / MAX_VOXELS_ALONG, max(c.gap for c in clouds) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        rows = list(zip(clouds, gaps, others, strict=True))
-        solids = parallel_map(lambda row, h=h: _solid(row[0], h, *row[1:], scene.floor, photographed, skin), rows)
+        solids = parallel_map(lambda cloud, h=h: _solid(scene, cloud, h, skin), clouds)
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
@@ -171,16 +178,14 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
-def _solid(
-    points: np.ndarray, h: float, gap: float, others: np.ndarray | None, floor: float | None, photographed: bool,
-    skin: bool,
-) -> tuple[np.ndarray, float, bool]:  # fmt: skip
+def _solid(scene: Scene, cloud: SurfaceCloud, h: float, skin: bool) -> tuple[np.ndarray, float, bool]:
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
     of volume that each represents; and whether it was extended down to the floor, as one that would tip over although
-    it stood when `photographed`.
+    it stood when photographed.
     """
-    stands = _stands(points, h, floor)
-    body, low = closed_body(points, h, gap, floor if stands else None, others)
+    stands = _stands(cloud.points, h, scene.floor)
+    body, low = closed_body(cloud.points, h, cloud.gap, scene.floor if stands else None, cloud.others)
+    photographed = scene.cameras is not None  # so the objects were at rest
     extended = photographed and stands and _topples(body)
     if extended:
         bottom = int(body.any((0, 1)).argmax())

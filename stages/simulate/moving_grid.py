@@ -31,7 +31,7 @@ class GridBodies:
 
     body: Int[Tensor, "p"]  # row of each particle's object in `objects`; particles are in the order of their bodies
     objects: Sequence[SceneObject]
-    shapes: Sequence[BodyShape] | None = None  # by default of voxels, see Solver
+    shapes: Sequence[BodyShape] | None = None  # by default of voxels, see SolverOptions
 
 
 class MovingGrid:
@@ -41,8 +41,8 @@ class MovingGrid:
         self.box, self._bodies, self._fixed = box, bodies, fixed
         sizes = torch.bincount(bodies.body).tolist()
         self._copies, self._max_nodes = len(sizes), mpm.max_contact_nodes(device)
-        options = mpm.SolverOptions(schedule="contact")
-        self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes, bodies.shapes)
+        options = mpm.SolverOptions(schedule="contact", shapes=bodies.shapes)
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes)
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:

@@ -93,8 +93,8 @@ def test_a_block_slides_down_a_slope_as_a_point_mass_does(device, degrees, frict
     for p in (slab, slider):
         p.x[:, 2] += 0.6
     start, sizes = slider.x.clone(), [len(slab), len(slider)]
-    options = mpm.SolverOptions(schedule="contact")
-    solver = mpm.Solver(mpm.join_particles([slab, slider]), BOX, DX, device, options, sizes, shapes)
+    options = mpm.SolverOptions(schedule="contact", shapes=shapes)
+    solver = mpm.Solver(mpm.join_particles([slab, slider]), BOX, DX, device, options, sizes)
     x, _ = moved(solver, sizes, 20, G)
     a = math.radians(degrees)
     down = float(((x[1] - start).mean(0) @ R)[0])

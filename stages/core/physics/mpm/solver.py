@@ -132,7 +132,7 @@ def substep_rate(dx: float, speed: float, viscosity: float = 0.0) -> float:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Colliders, damping and schedule of the solver.
+    """Colliders, damping, schedule and shapes of the solver.
 
     `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule` is one of
 
@@ -146,12 +146,14 @@ class SolverOptions:
                   with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py); otherwise
                   bodies in one scene share the velocity of a node, and stick to each other
 
-    Raises ValueError for another schedule.
+    `shapes` are the surfaces of the bodies of the schedule `contact`, by default those of voxels of half a grid cell
+    with a particle each. Raises ValueError for another schedule.
     """
 
     colliders: tuple[Collider, ...] = ()
     damping: float = 0.0
     schedule: str = "auto"
+    shapes: Sequence[BodyShape] | None = None
 
     def __post_init__(self):
         if self.schedule not in SCHEDULES:
@@ -165,14 +167,13 @@ class Solver:
     """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
     `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
-    interact, except by the schedule `contact`. Their surfaces are then those of `shapes`, by default those of voxels of
-    half a grid cell with a particle each. Raises ValueError for sizes that do not
-    fit the particles and for grids that are too large.
+    interact, except by the schedule `contact`. Raises ValueError for sizes that do not fit the particles and for grids
+    that are too large.
     """
 
     def __init__(
         self, particles: Particles, box: Box, dx: float, device: str = "cpu", options: SolverOptions = DEFAULTS,
-        sizes: Sequence[int] | None = None, shapes: Sequence[BodyShape] | None = None,
+        sizes: Sequence[int] | None = None,
     ):  # fmt: skip
         schedule = options.schedule
         if schedule == "auto":
@@ -195,7 +196,7 @@ class Solver:
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
         shared = self.rows, plastic, bouncy
         quanta = self._quanta() if exact else None
-        contact = self._body_contact(particles, sizes, shapes) if schedule == "contact" else None
+        contact = self._body_contact(particles, sizes, options.shapes) if schedule == "contact" else None
         if fused:
             self._substepper = FusedSubsteps(*shared, quanta)
         elif exact:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stages.core.errors import InputError
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.body_shapes import BodyShape
@@ -35,15 +36,24 @@ class GridBodies:
 
 
 class MovingGrid:
-    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`."""
+    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`.
+
+    Raises InputError for a grid that is too large.
+    """
 
     def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, bodies: GridBodies, fixed: bool):
-        self.box, self._bodies, self._fixed = box, bodies, fixed
+        self.box, self._bodies, self._fixed, self._dx = box, bodies, fixed, dx
         sizes = torch.bincount(bodies.body).tolist()
         self._copies, self._max_nodes = len(sizes), mpm.max_contact_nodes(device)
+        if not fixed and self._nodes(box) > self._max_nodes:
+            self.box = self._around(particles.x.amin(0).tolist(), particles.x.amax(0).tolist(), MARGIN * dx)
         options = mpm.SolverOptions(schedule="contact", shapes=bodies.shapes)
         self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes)
-        self.solver = self._build(particles, box)
+        try:
+            self.solver = self._build(particles, self.box)
+        except ValueError as error:
+            remedy = "give a smaller --box" if fixed else "simulate fewer objects, or objects nearer to each other"
+            raise InputError(f"--engine mpm: {error}; {remedy}, use a coarser --quality or another --engine") from error
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
         """Advance by `duration` [s] under these accelerations [m/s^2], on a new grid where the old one is too small."""
@@ -52,7 +62,7 @@ class MovingGrid:
 
     def _make_room(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
         """Move the grid if a particle could come near one of its faces, except the floor, within a frame."""
-        rows, dx = self.solver.rows, self.solver.dx
+        rows, dx = self.solver.rows, self._dx
         x, speed = rows["x"], float(rows["v"].norm(dim=1).max()) + duration * float(acceleration.norm(dim=1).max())
         if not math.isfinite(speed) or self._fixed:
             return
@@ -74,12 +84,12 @@ class MovingGrid:
 
     def _around(self, low: Sequence[float], high: Sequence[float], room: float) -> mpm.Box:
         """A box that leaves `room` [m] around the particles, its lower corner on the lattice of the present one."""
-        step = BLOCK * self.solver.dx
+        step = BLOCK * self._dx
         corner = [b + step * math.floor((a - room - b) / step) for a, b in zip(low[:2], self.box.low[:2], strict=True)]
         return replace(self.box, low=(*corner, self.box.low[2]), high=tuple(a + room for a in high))
 
     def _nodes(self, box: mpm.Box) -> float:
-        return self._copies * math.prod((b - a) / self.solver.dx + 16 for a, b in zip(box.low, box.high, strict=True))
+        return self._copies * math.prod((b - a) / self._dx + 16 for a, b in zip(box.low, box.high, strict=True))
 
     def _farthest(self) -> str:
         """The object whose middle is farthest from the median of all."""

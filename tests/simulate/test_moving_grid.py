@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from stages.core.errors import InputError
 from stages.core.kernels.mpm.grid import BLOCK
+from stages.core.physics.mpm import solver
 from stages.core.physics.mpm.domain import Box
 from stages.core.physics.mpm.solver import ParticleMaterial, at_rest, join_particles
 from stages.core.scene.scene import SceneObject
@@ -60,3 +62,17 @@ def test_what_flies_away_is_the_object_farthest_from_the_others(device, monkeypa
     moving.advance(DT, torch.zeros(81, 3))
     assert "object 1 (fast) moves too far from the other objects" in caplog.text
     assert moving.box.low == (0.4, 1.5, 0.0)  # and it stays there
+
+
+def test_a_grid_for_many_bodies_begins_near_them_and_one_too_large_is_an_error(device, monkeypatch):
+    particles, bodies = join_particles([cube((x, 0, 0.5), (0, 0, 0)) for x in (0.0, 1.0)]), GridBodies(
+        torch.arange(2).repeat_interleave(27), OBJECTS)  # fmt: skip
+    wide = Box((-3.0, -3.0, 0.0), (4.0, 3.0, 3.0))
+    monkeypatch.setattr(moving_grid.mpm, "max_contact_nodes", lambda device: 200_000)
+    near = MovingGrid(particles, wide, DX, device, bodies, fixed=False).box
+    assert near.low[0] > -1 and near.high[0] < 2 and near.low[2] == 0
+    for module, name in ((solver, "MAX_NODES"), (solver, "max_batch_nodes")):
+        monkeypatch.setattr(module, name, 5_000 if name == "MAX_NODES" else lambda device: 5_000)
+    for fixed, remedy in ((True, "smaller --box"), (False, "fewer objects")):
+        with pytest.raises(InputError, match=f"--engine mpm: .*too large; .*{remedy}.*--quality"):
+            MovingGrid(particles, wide, DX, device, bodies, fixed=fixed)

@@ -67,7 +67,7 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options
     for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small ones last
         labels[members] = number
     ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
-    return refine_outlines(scene, ids)
+    return refine_outlines(scene, ids, device=model.input_projection.weight.device)
 
 
 def _path(scored: ScoredCandidates, distance: Float[Tensor, "n"]) -> set[int]:

@@ -43,6 +43,7 @@ for _command in (reconstruct, segment, refine):
 
 @app.command()
 def simulate(
+    context: typer.Context,
     scene: SceneIn,
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     steps: Annotated[int, Option(help="number of frames, including the initial state")] = SimulateOptions.steps,
@@ -131,7 +132,8 @@ def simulate(
         keypoints=keypoints, weights=weights, integrator=integrator, contact=contact, rest=rest, live=live,
         browser=browser, port=port, seed=seed, device=device,
     )  # fmt: skip
-    load("stages.simulate.stage:run")(scene, out, options)
+    given = {name for name in context.params if context.get_parameter_source(name).name == "COMMANDLINE"}
+    load("stages.simulate.stage:run")(scene, out, options, given)
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,13 +31,18 @@ log = logging.getLogger(__name__)
 MIN_EXTENT = 1e-5  # of an object, relative to its coordinates, which have 24 bits
 
 
-def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
+def run(
+    scene: Path, out: Path,
+    options: SimulateOptions = SimulateOptions(),  # noqa: B008 -- frozen
+    given: Collection[str] = (),
+) -> None:  # fmt: skip
     """Simulate the objects of a scene: scene.ply -> traj.h5.
 
-    With --live it runs until Ctrl-C. Raises InputError for wrong options or input, and when the simulation diverges;
-    the frames up to then are kept in OUT.partial.h5.
+    With --live it runs until Ctrl-C. `given`: names of the options that a recording (--forces) does not replace, beside
+    those that differ from their defaults. Raises InputError for wrong options or input, and when the simulation
+    diverges; the frames up to then are kept in OUT.partial.h5.
     """
-    began, options = time.monotonic(), with_recorded(options)
+    began, options = time.monotonic(), with_recorded(options, given)
     options = replace(options, keypoints=options.keypoint_count)
     if options.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
@@ -82,16 +88,20 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
 
 
-def with_recorded(options: SimulateOptions) -> SimulateOptions:
+def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> SimulateOptions:
     """With --forces RECORDING the options that made it, and its number of frames, where none are given.
 
-    Not those that name other files (--materials, --weights), which must be given again.
+    Not those that name other files (--materials, --weights), which must be given again, nor those of the recorded
+    engine where another one is given.
     """
     recording = None if options.forces is None else read_recording(options.forces)
     if recording is None:
         return options
     default, recorded = SimulateOptions(), {**recording.options, "steps": recording.frames}
-    return replace(options, **{k: v for k, v in recorded.items() if getattr(options, k) == getattr(default, k)})
+    given = {k for k in recorded if k in given or getattr(options, k) != getattr(default, k)}
+    if "engine" in given and options.engine != recorded["engine"]:
+        given |= {"contact", "integrator"}
+    return replace(options, **{k: v for k, v in recorded.items() if k not in given})
 
 
 def with_objects(scene: Scene, path: Path, device: str = "auto") -> Scene:

@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import h5py
@@ -17,6 +17,7 @@ from stages.core.physics import solid_surface
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import DEFAULT_MATERIAL, Material
 from stages.core.physics.mpm.domain import MAX_NODES
+from stages.core.physics.recording import OPTIONS
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -27,7 +28,7 @@ from stages.simulate import mpm as engine
 from stages.simulate.mpm import _stable_material
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import MIN_ROOM, _default_box, set_up_scene, tell_of_unseen_sides
-from stages.simulate.stage import run, with_objects
+from stages.simulate.stage import run, with_objects, with_recorded
 from tests.conftest import ball
 from tests.segment.tabletop import three_apart
 from tests.simulate.motion import Motion, roll_out
@@ -254,6 +255,25 @@ def test_damaged_options_of_a_trajectory_are_refused(tmp_path, file):
             stored.attrs["provenance"] = json.dumps({**made_by, "options": {**made_by["options"], name: value}})
         with pytest.raises(InputError, match=f"its options of `ngff simulate` are damaged.*{name}"):
             run(file, tmp_path / "again.h5", SimulateOptions(forces=trajectory))
+
+
+def test_a_recording_gives_all_options_that_are_not_given(tmp_path, file):
+    """Those that are repeated are all but what names files and devices, and what acts, which is in the prompts."""
+    apart = {"material": (), "rest": False, "gravity": 1.62, "steps": 2, "quality": "draft"}
+    run(file, tmp_path / "moon.h5", SimulateOptions(engine="mpm", **apart))
+    again = with_recorded(SimulateOptions(forces=tmp_path / "moon.h5"))
+    assert {name: getattr(again, name) for name in apart} == apart and again.engine == "mpm"
+    earth = with_recorded(SimulateOptions(forces=tmp_path / "moon.h5"), {"gravity", "forces"})
+    assert earth.gravity == SimulateOptions.gravity and not earth.rest
+    elsewhere = {"steps", "materials", "force", "forces", "pin", "velocity", "lift", "weights", "device", "live",
+                 "browser", "port"}  # fmt: skip
+    assert set(OPTIONS) == {f.name for f in fields(SimulateOptions)} - elsewhere
+
+
+def test_a_recording_of_another_engine_keeps_that_engines_options_to_itself(tmp_path, file):
+    run(file, tmp_path / "a.h5", SimulateOptions(engine="ngff", contact="solved", steps=2))
+    assert with_recorded(SimulateOptions(forces=tmp_path / "a.h5")).contact == "solved"
+    assert with_recorded(SimulateOptions(forces=tmp_path / "a.h5", engine="mpm")).contact == "auto"
 
 
 def test_objects_without_extent_are_left_out(balls, caplog):

@@ -13,12 +13,12 @@ from stages.core.physics.forces import ForcePrompts, read_forces
 from stages.core.scene.files import read_json_file
 from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import number, reason, rows, table, text, texts, whole
+from stages.core.scene.schema import flag, number, reason, rows, table, text, texts, whole
 
 # Options of `ngff simulate` that --forces repeats -> checks of their values; not those that name other files.
 OPTIONS: dict[str, Callable] = {
     "dt": number, "engine": text, "gravity": number, "quality": text, "material": texts, "floor": number,
-    "friction": number, "box": text, "keypoints": whole, "integrator": text, "contact": text,
+    "friction": number, "box": text, "keypoints": whole, "integrator": text, "contact": text, "rest": flag,
     "seed": lambda value, what: whole(value, what, 0, MAX_SEED),
 }  # fmt: skip
 

@@ -419,6 +419,7 @@ def bench_complete(
 def bench_fit(
     scenes: SceneCount = 20,
     only: Annotated[str, Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
+    truth: Annotated[str, Option(help="engine of the motions; default: that which fits them")] = "",
     noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
     evaluations: Annotated[int, Option(help="largest number of simulations of a scene")] = 1500,
     minutes: Annotated[float, Option(help="longest time of a scene [min]")] = 10.0,
@@ -432,8 +433,8 @@ def bench_fit(
     from stages.lab.bench.fit import FitBenchOptions, run
 
     options = FitBenchOptions(
-        scenes=scenes, only=only, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers, seed=seed,
-        device=device,
+        scenes=scenes, only=only, truth=truth, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers,
+        seed=seed, device=device,
     )  # fmt: skip
     print_results(lambda path: run(path, options), out, as_json)
 

@@ -38,6 +38,7 @@ class FitBenchOptions:
 
     scenes: int = 20  # of the kinds in turn
     only: str = ""  # one of KINDS; empty: all
+    truth: str = ""  # engine of the motions; empty: that which fits them
     noise: float = 0.002  # of the track [m]
     evaluations: int = 1500
     minutes: float = 10.0  # for a scene
@@ -48,6 +49,8 @@ class FitBenchOptions:
     def __post_init__(self):
         if self.only and self.only not in KINDS:
             raise InputError(f"--only {self.only}: choose from {', '.join(KINDS)}")
+        if self.truth and self.truth not in ENGINES:
+            raise InputError(f"--truth {self.truth}: choose from {', '.join(ENGINES)}")
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,9 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
     simulate = SimulateOptions(engine=case.engine, contact=contact, quality="draft", steps=STEPS, keypoints=KEYPOINTS,
                                device=options.device)  # fmt: skip
     rng = torch.Generator().manual_seed(options.seed)
-    x = _motion(scene, keypoints, case.seen, case.materials, simulate)
-    truth = Trajectory(scene, SimulationInfo(simulate.dt, (0.0, 0.0, -simulate.gravity), case.engine), keypoints,
+    true = replace(simulate, engine=options.truth, contact=AUTO) if options.truth else simulate
+    x = _motion(scene, keypoints, case.seen, case.materials, true)
+    truth = Trajectory(scene, SimulationInfo(simulate.dt, (0.0, 0.0, -simulate.gravity), true.engine), keypoints,
                        bind_gaussians(scene, keypoints), x + options.noise * torch.randn(x.shape, generator=rng),
                        torch.zeros(STEPS, len(case.things), 3), torch.zeros(STEPS, len(case.things), 4),
                        Path())  # fmt: skip
@@ -108,7 +112,7 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
                              minutes=options.minutes, workers=options.workers, device=options.device)  # fmt: skip
     fit = solve(pose_problem(scene, truth, replace(case.seen, velocity={}), fit_options), fit_options)
     found, _ = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
-    other = _motion(scene, keypoints, case.other, case.materials, simulate)
+    other = _motion(scene, keypoints, case.other, case.materials, true)
     rmse = [float((_motion(scene, keypoints, case.other, m, simulate) - other).square().sum(-1).mean().sqrt())
             for m in (fit.problem.materials, found)]  # fmt: skip
     return {"rows": errors_of(fit, case), "default_rmse": rmse[0], "fitted_rmse": rmse[1], "fit_rmse": fit.rmse[1],

@@ -18,15 +18,7 @@ from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
-from stages.lab.fit.search import (
-    SMALLEST_ERROR,
-    Estimate,
-    Simulations,
-    descend,
-    search,
-    settled,
-    simulations,
-)
+from stages.lab.fit.search import Estimate, Simulations, descend, search, settled, simulations
 from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -118,8 +110,7 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
 def _settled(sims: Simulations, found: Estimate) -> Fit:
     """The fit near an estimate, with its uncertainty."""
     problem, frames = sims.problem, len(sims.problem.track)
-    error = _error(problem, sims.residuals([found.x], frames)[0])
-    found = settled(sims, frames, found, error)
+    found = settled(sims, frames, found, sims.error(found.x, frames))
     before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
     fit = Fit(problem, found, found.x, (before, after), sims.count, 0.0)
     unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
@@ -141,17 +132,6 @@ def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> 
             reset, accepted = rows, np.clip(found.x + covariance[:, rows] @ weighed, 0, 1)
             accepted[rows] = start[rows]
     return accepted
-
-
-def _error(problem: Problem, residuals: np.ndarray) -> float:
-    """Standard deviation of a residual [tolerances] for intervals, from those of a fit.
-
-    Noise is independent from frame to frame. Residuals beyond it are taken as fully correlated: they
-    count as one observation.
-    """
-    noise = problem.noise_level**2
-    excess = max(0.0, problem.mean_square(residuals) - problem.noise_margin * noise)
-    return max((noise + problem.observations * excess) ** 0.5, SMALLEST_ERROR)
 
 
 def describe(fit: Fit) -> list[str]:

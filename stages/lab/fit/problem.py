@@ -134,6 +134,21 @@ class Problem:
         """Standard deviation of a coordinate of the track [tolerances]."""
         return self.noise * float(self.tolerance.pow(-2).mean()) ** 0.5
 
+    @property
+    def noise_cost(self) -> float:
+        """The cost of the track's noise."""
+        return float(torch.log1p(3 * (self.noise / self.tolerance) ** 2).mean())
+
+    def error(self, residuals: np.ndarray) -> float:
+        """Standard deviation of a residual [tolerances] for intervals, from those that remain.
+
+        Noise is independent from frame to frame. Residuals beyond it are taken as fully correlated: they count as one
+        observation.
+        """
+        noise = self.noise_level**2
+        excess = max(0.0, self.mean_square(residuals) - self.noise_margin * noise)
+        return (noise + self.observations * excess) ** 0.5
+
     def cost(self, residuals: np.ndarray) -> float:
         """Mean of log(1 + squared error / tolerance^2) over frames and objects.
 

@@ -4,7 +4,9 @@ Over the whole track at once, collisions give the cost many local minima; the fi
 Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
 stays near its initial value, by a normal prior. Derivatives are by differences about as large as the uncertainty, in
 independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
-noise remain, CMA-ES searches the region which the segments before have left.
+noise remain, CMA-ES searches the region which the segments before have left. An engine need not be able to follow the
+track that closely: where the search no longer gains, what remains is taken for the error of the engine, which is then
+expected of longer segments and widens the uncertainty.
 Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
 filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
 """
@@ -37,7 +39,8 @@ NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)  # differences [standard deviations], in
 ONE_SIDED = 3.0  # ratio of the changes to both sides above which the smaller one gives a derivative
 STEPS = 6  # iterations of Levenberg and Marquardt's method
 PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative fall of the cost at which a method ends
-SPREADS = (0.5, 1.0, 0.2, 1.5)  # of CMA-ES, in turn [standard deviations]
+SPREADS = (0.5, 1.0, 0.2, 1.5)  # of CMA-ES, in turn [standard deviations]; it ends when none of them gains
+GAIN = 0.05  # least relative fall of the cost that counts as one
 GENERATIONS = 15  # of CMA-ES at a time
 ENOUGH = 1.15, 0.0005  # cost at which a fit ends: a factor on that of the track's noise, and a constant
 SMALLEST = 0.002  # standard deviation of a parameter [ranges]
@@ -73,6 +76,14 @@ class Simulations:
         """Costs of the first frames."""
         part = self.problem.first_frames(frames)
         return [part.cost(residuals) for residuals in self.residuals(points, frames)]
+
+    def cost(self, x: np.ndarray, frames: int) -> float:
+        """Cost of the first frames."""
+        return self.costs([x], frames)[0]
+
+    def error(self, x: np.ndarray, frames: int) -> float:
+        """Standard deviation of a residual in the first frames [tolerances], from those that remain at x."""
+        return max(self.problem.first_frames(frames).error(self.residuals([x], frames)[0]), SMALLEST_ERROR)
 
     @property
     def noise(self) -> float:
@@ -112,20 +123,24 @@ def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
     x, lengths = known.x, [min(FIRST, total)]
     while lengths[-1] < total:
         lengths.append(min(total, max(lengths[-1] + 1, int(GROWTH * lengths[-1]))))
+    of_noise = enough = ENOUGH[0] * sims.problem.noise_cost + ENOUGH[1]
     for k, frames in enumerate(tqdm(lengths, unit="segment")):
         if time.perf_counter() > until or sims.count > options.evaluations:
             break
-        if _within_noise(sims, frames, x):
+        if sims.cost(x, frames) < enough:
             continue
         x = descend(sims, frames, Estimate(x, known.root), sims.noise)
         share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)  # few segments need it
-        attempt = 0
-        while not _within_noise(sims, frames, x) and sims.count < share and time.perf_counter() < until:
+        cost, attempt, idle = sims.cost(x, frames), 0, 0
+        while cost > enough and idle < len(SPREADS) and sims.count < share and time.perf_counter() < until:
             x = _evolve(sims, frames, x, known, attempt, options)
+            before, cost = cost, sims.cost(x, frames)
+            idle = 0 if cost < (1 - GAIN) * before else idle + 1
             attempt += 1
-        if _within_noise(sims, frames, x):
-            known = narrowed(sims, frames, Estimate(x, known.root), sims.noise)
-        log.debug("%d frames, cost %.3g, %d motions: %s", frames, sims.costs([x], frames)[0], sims.count, x.round(3))
+        enough = max(enough, ENOUGH[0] * cost)
+        error = sims.noise if cost < of_noise else sims.error(x, frames)
+        known = narrowed(sims, frames, Estimate(x, known.root), error)
+        log.debug("%d frames, cost %.3g, %d motions: %s", frames, cost, sims.count, x.round(3))
     return Estimate(x, known.root)
 
 
@@ -140,12 +155,6 @@ def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Es
         known = narrowed(sims, frames, Estimate(x, np.diag(np.minimum(deviations, PRIOR))), error, FAR)
         deviations = known.deviations
     return known
-
-
-def _within_noise(sims: Simulations, frames: int, x: np.ndarray) -> bool:
-    """Whether the residual is about the noise of the track."""
-    expected = torch.log1p(3 * (sims.problem.noise / sims.problem.tolerance) ** 2).mean()
-    return sims.costs([x], frames)[0] < ENOUGH[0] * float(expected) + ENOUGH[1]
 
 
 def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np.ndarray:

@@ -24,7 +24,7 @@ from stages.lab.fit.fit import Fit, _command, run, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import _first_velocity, estimate_noise, pose_problem, read_problem
-from stages.lab.fit.search import PRIOR, Estimate, _derivatives, _evolve, descend, narrowed, simulations
+from stages.lab.fit.search import PRIOR, Estimate, Simulations, _derivatives, _evolve, descend, narrowed, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner, ring
@@ -269,3 +269,42 @@ def test_derivatives_are_central_but_for_a_side_with_another_motion(residual):
     sims = SimpleNamespace(residuals=lambda points, frames: [np.array([residual(float(x[0]) - 0.5)]) for x in points])
     found = float(_derivatives(sims, 1, Estimate(np.array([0.5]), np.array([[step]])))[0, 0])
     assert found == pytest.approx(step, rel=1e-6)  # per unit of the root
+
+
+class Ramp:
+    """A track (k frames) of a height that no motion reaches, where a ramp has two parameters; stands for a Problem."""
+
+    noise_level, noise_cost = 1e-3, 1e-6
+    parameters = [SimpleNamespace(start=0.2, step=0.2, coordinate=lambda value: value) for _ in range(2)]
+
+    def __init__(self, frames: int = 40):
+        self.track = np.arange(frames) / 40
+
+    def first_frames(self, frames: int) -> "Ramp":
+        return Ramp(frames)
+
+    def residuals(self, x: np.ndarray) -> np.ndarray:
+        return (x[0] - 0.6) + 4 * (x[1] - 0.4) * self.track + 0.05 * np.sin(25 * self.track)
+
+    def cost(self, residuals: np.ndarray) -> float:
+        return float(np.log1p(residuals**2).mean())
+
+    def error(self, residuals: np.ndarray) -> float:
+        return float(np.square(residuals).sum() ** 0.5)
+
+
+@pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
+def test_a_track_that_the_engine_cannot_follow_to_its_noise_is_followed_to_its_end():
+    """The search does not use up its simulations on the first segments."""
+
+    class Ramps(Simulations):
+        def residuals(self, points, frames):
+            self.count += len(points)
+            return [Ramp(frames).residuals(np.clip(x, 0, 1)) for x in points]
+
+    sims = Ramps(Ramp(), map)
+    found = search.search(sims, replace(OPTIONS, evaluations=10_000))
+    assert sims.count < 2_000
+    np.testing.assert_allclose(found.x, [0.6, 0.4], atol=0.02)
+    assert (found.deviations > 0.002).all()  # by more than the noise, and less than before
+    assert (found.deviations < 0.15).all()

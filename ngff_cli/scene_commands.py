@@ -155,7 +155,7 @@ def segment(
         float, Option(help="ignore objects whose longest side is below this fraction of the camera distance")
     ] = SegmentOptions.min_size,
     detail: Annotated[
-        float, Option(help="merge threshold of regions, 0 to 2; lower values give more objects")
+        float, Option(help="backend geometric: merge threshold of regions, 0 to 2; lower values give more objects")
     ] = SegmentOptions.detail,
     scale_reference: Annotated[
         str, Option(help='a length measured on an object [m]: "object=1 height=0.12" (or length=)')

@@ -70,6 +70,10 @@ class ReconstructOptions:
     def __post_init__(self):
         if self.matcher not in FEATURE_EXTRACTORS:
             raise InputError(f"--matcher {self.matcher}: choose from {', '.join(FEATURE_EXTRACTORS)}")
+        if self.backend == "classic" and (self.weights or self.download):
+            raise InputError("--weights and --download: only with --backend pi3 or pi3-splat; add it or drop them")
+        if self.backend != "classic" and self.matcher != "sift":
+            raise InputError(f"--matcher {self.matcher}: only with --backend classic, not {self.backend}; drop one")
         if self.quality not in QUALITY_PRESETS:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
         if self.up not in ("auto", *UP_SIDES):
@@ -82,8 +86,8 @@ class ReconstructOptions:
             raise InputError(f"--sync {self.sync}: choose from {', '.join(SYNCHRONISATIONS)}")
         if not 0.1 <= self.fps <= 100_000:
             raise InputError(f"--fps {self.fps:g}: give the frames a second, 0.1 to 100000")
-        if not self.sequence and (self.offsets or self.sync != "motion"):
-            raise InputError("--sync and --offsets: only with --sequence")
+        if not self.sequence and (self.offsets or self.sync != "motion" or self.fps != type(self).fps):
+            raise InputError("--sync, --offsets and --fps: only with --sequence; add it or drop them")
         parse_scale(self.scale_reference)
         if self.iterations is not None and self.iterations < 0:
             raise InputError(f"--iterations {self.iterations}: give 0 for none, or more")

@@ -53,6 +53,8 @@ class RefineOptions:
     def __post_init__(self):
         if self.completer == "library" and self.library is None:
             raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
+        if self.library is not None and self.chosen != "library":
+            raise InputError(f"--library {self.library}: not with --completer {self.completer}; drop one of them")
         if not self._is_generator and (self.photos or self.weights or self.download):
             raise InputError(
                 f"--photos, --weights and --download only work with --completer {GENERATORS}; add it or drop them"

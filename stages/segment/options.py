@@ -58,6 +58,10 @@ class SegmentOptions:
             raise InputError(f"--photos and --download only work with --backend {NETWORKS}; add it or drop them")
         if not self._is_network and self.weights and self.backend != "learned":
             raise InputError(f"--weights only works with --backend {NETWORKS} or learned; add it or drop --weights")
+        if self.chosen != self.backend != type(self).backend:
+            raise InputError(f"--{self.chosen} selects a backend of its own; drop it or --backend {self.backend}")
+        if self.detail != type(self).detail and self.chosen != "geometric":
+            raise InputError("--detail: only with --backend geometric; add it or drop --detail")
         if self.undistorted and not (self.masks or self.boxes or self.points or self.photos):
             raise InputError("--undistorted: only applies to --masks, --boxes, --points, --photos; add one or drop it")
         if self.max_objects < 1:

@@ -90,6 +90,8 @@ class SimulateOptions:
             raise InputError(f"--integrator {self.integrator}: choose from {', '.join(INTEGRATORS)}")
         if self.integrator != "step" and self.engine in ENGINES and not ENGINES[self.engine].weights:
             raise InputError(f"--integrator {self.integrator}: only for learned engines, not for {self.engine}")
+        if self.weights is not None and self.engine in ENGINES and not ENGINES[self.engine].weights:
+            raise InputError(f"--weights {self.weights}: only for learned engines, not for {self.engine}")
         if self.contact not in CONTACTS:
             raise InputError(f"--contact {self.contact}: choose from {', '.join(CONTACTS)}")
         if self.contact != AUTO and self.engine not in (AUTO, "ngff"):

@@ -1,6 +1,7 @@
 """Learned backends: the steps after the network with true geometry in place of its output; complete tiny runs."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -62,6 +63,14 @@ def surface_error(points: torch.Tensor) -> torch.Tensor:
     block = torch.hypot(outside, (points[:, 2] - top).clamp_min(0))
     inside = torch.stack([a - points[:, 0].abs(), b - points[:, 1].abs(), top - points[:, 2]]).abs().amin(0)
     return torch.minimum(torch.where(block > 0, block, inside), points[:, 2].abs())
+
+
+@pytest.mark.parametrize("options", [
+    {"weights": Path("a")}, {"download": True}, {"backend": "pi3", "matcher": "aliked-lightglue"},
+])  # fmt: skip
+def test_options_of_another_backend_are_refused(options):
+    with pytest.raises(InputError, match="only with --backend"):
+        ReconstructOptions(**options)
 
 
 @pytest.mark.parametrize("splats", [False, True], ids=["pi3", "pi3-splat"])

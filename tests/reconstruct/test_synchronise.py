@@ -126,6 +126,8 @@ def test_one_film_is_too_few(tmp_path):
 def test_sequence_options_need_sequence():
     with pytest.raises(InputError, match="only with --sequence"):
         ReconstructOptions(offsets="a=0,b=1")
+    with pytest.raises(InputError, match="only with --sequence"):
+        ReconstructOptions(fps=30.0)
     with pytest.raises(InputError, match="--sync"):
         ReconstructOptions(sequence=True, sync="smell")
 

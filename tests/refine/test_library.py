@@ -121,6 +121,8 @@ def test_invalid_libraries_are_refused(seen, tmp_path):
 
 def test_provenance_records_the_library(seen, folder, tmp_path):
     write_scene(tmp_path / "labelled.ply", replace(seen, gaussians=concatenate([seen.gaussians[::4]])))
-    options = RefineOptions(completer="none", library=folder, background=False)
+    with pytest.raises(InputError, match="--library.*: not with --completer none"):
+        RefineOptions(completer="none", library=folder)
+    options = RefineOptions(library=folder, background=False)
     run(tmp_path / "labelled.ply", tmp_path / "out.ply", options)
     assert read_scene(tmp_path / "out.ply").provenance["options"]["library"] == str(folder)

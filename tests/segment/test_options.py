@@ -1,5 +1,6 @@
 """Options of `ngff segment`: the limits of their values, and which exclude each other."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ SOME = Path("some")
     ("names", ("", "1=duck", "65535=a, 007=b b,"), ("duck", "0=a", "1=", "1 2=a", "x=a", "123456=a")),
 ])  # fmt: skip
 def test_limits_of_options(name, accepted, refused):
-    check_limits(SegmentOptions, name, accepted, refused)
+    check_limits(partial(SegmentOptions, backend="geometric"), name, accepted, refused)
 
 
 def test_names_by_number():
@@ -33,6 +34,8 @@ def test_names_by_number():
     ({"download": True}, "--photos and --download only work"),
     ({"backend": "geometric", "weights": SOME}, "--weights only works with --backend sam2 or learned"),
     ({"undistorted": True}, "--undistorted: only applies to"),
+    ({"detail": 0.3}, "--detail: only with --backend geometric"),
+    ({"backend": "geometric", "detail": 0.3, "points": ("a",)}, "--points selects a backend of its own"),
 ])  # fmt: skip
 def test_options_that_exclude_each_other(options, message):
     with pytest.raises(InputError, match=message):

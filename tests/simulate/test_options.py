@@ -1,6 +1,7 @@
 """Options of `ngff simulate`: the limits of their values, and what follows from them."""
 
 import math
+from pathlib import Path
 
 import pytest
 
@@ -42,6 +43,8 @@ def test_integrators_are_for_learned_engines():
     for engine in ("mpm", "rigid"):
         with pytest.raises(InputError, match=f"only for learned engines, not for {engine}"):
             SimulateOptions(engine=engine, integrator="euler")
+        with pytest.raises(InputError, match=f"--weights a: only for learned engines, not for {engine}"):
+            SimulateOptions(engine=engine, weights=Path("a"))
         SimulateOptions(engine=engine, integrator="step")
 
 

@@ -105,8 +105,8 @@ def simulate(
         bool,
         Option(
             "--rest/--no-rest",
-            help="hold objects of photos until something acts on them, or let them fall from where they are, "
-            "as in photos of a moment",
+            help="engines rigid and ngff: hold objects of photos until something acts on them, or let them fall from "
+            "where they are, as in photos of a moment",
         ),
     ] = SimulateOptions.rest,
     live: Annotated[
@@ -174,7 +174,7 @@ def render(
         Option(
             "--playable",
             help="with -o film.html: objects can be dragged, pushed and lifted in the page, "
-            "which computes their motion (trajectories of the engine ngff)",
+            "which computes their motion (trajectories of --engine ngff --contact learned)",
         ),
     ] = RenderOptions.playable,
     frame: Annotated[

@@ -32,7 +32,7 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.moving_grid import GridBodies, MovingGrid
 from stages.simulate.options import MpmQuality, SimulateOptions
-from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
+from stages.simulate.setup import SceneSetup, choose_for_bodies, held_as_seen, set_up_scene
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
@@ -54,6 +54,8 @@ def rollout(
         level = replace(level, step=min(level.step, GPU_STEP))
     setup = set_up_scene(scene, prompts, options, refinement=2 if fine else 1)
     setup.warn_of_lifted(scene)
+    if held_as_seen(scene, options):
+        log.warning("--engine mpm does not hold objects of photos at rest: all of them move from the start")
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
     box = mpm.Box(tuple(unit * v for v in setup.box.low), tuple(unit * v for v in setup.box.high))

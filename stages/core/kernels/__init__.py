@@ -8,6 +8,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | file                          | written in                  | specified and tested by                              |
 |-------------------------------|-----------------------------|------------------------------------------------------|
 | skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
+| depth_lookup                  | Warp                        | `DepthLookup` in the file                            |
 | nearest_rotations             | Warp                        | `geometry.rotations.nearest_rotation`                |
 | sphere_shadows                | Warp                        | `blocked_light_reference` in the file                |
 | adam                          | PyTorch (CPU), Warp         | `torch.optim.Adam`                                   |
@@ -21,17 +22,29 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | splat/photometric_loss        | PyTorch (CPU), Warp         | `photometric_loss_reference` in the file             |
 | mpm/transfers, grid, nodes,   | Warp with C++ and CUDA      | `transfers.substep_reference` (one free substep);    |
 |   split, fused, exact         |   snippets                  |   split and fused are tested against each other      |
-| mpm/contact                   | Warp                        | momentum, Coulomb's law, slopes                      |
+| mpm/contact, active           | Warp                        | momentum, Coulomb's law, slopes                      |
+| mpm/pins                      | Warp                        | beams whose parts are pinned                         |
 | mpm/constitutive              | Warp                        | theory, and `corotated_reference` in the file        |
 | field/normals                 | Warp                        | `normals_and_spacing_reference` in the file          |
 | field/rigid_motion            | Warp                        | `models.field.rigid_body` (drift, pose)              |
+| field/contact_search,         | Warp                        | `tests/core/kernels/contact_reference.py`, and       |
+|   surface_lookup              |                             |   `physics.solid_surface`                            |
+| field/contact_solve,          | Warp with C++ and CUDA      | `tests/core/kernels/contact_reference.py`            |
+|   contact_impulses,           |   snippets                  |                                                      |
+|   newton_system               |                             |                                                      |
+| field/rigid_frames,           | Warp                        | slides, slopes, rebounds and towers                  |
+|   contact_patches, groups     |                             |                                                      |
 | field/nearest, perceptron     | Triton                      | `..._reference` in each file                         |
 | field/skinny_matmul           | Triton                      | `A @ x` in double precision                          |
 | field/neighbourhoods          | Triton                      | `models.field.rest_shape`                            |
-| field/ other modules          | Triton                      | `ForceField.step` in `models.field.force_field`      |
+| field/bodies, broad_phase,    | Triton                      | `ForceField.step` in `models.field.force_field`      |
+|   contact_features,           |                             |                                                      |
+|   contact_messages,           |                             |                                                      |
+|   velocity_update,            |                             |                                                      |
+|   deformation_features        |                             |                                                      |
 
 `interop` passes tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches in parallel;
 `operators` hides kernels from torch.compile; `compilers` says which compilers are there;
-`splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
+`simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
 `physics` and `models` are the callers.
 """

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, kernel_device, launch, view
-from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
+from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
-from stages.core.kernels.splat.simd import by_device
+from stages.core.kernels.simd import by_device
 from stages.core.kernels.threads import parallel_map
 
 wp.set_module_options({"enable_backward": False})

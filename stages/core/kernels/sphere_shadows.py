@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, empty_arrays, kernel_device, launch, view, with_arrays
-from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
+from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,10 +11,10 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view, with_arrays
+from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 from stages.core.kernels.splat.binning import BinnedSplats, Bins, bin_splats
 from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_TRANSMITTANCE
 from stages.core.kernels.splat.projection import MIN_ALPHA
-from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 TILE = 16  # [px]

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from stages.core.kernels.simd import even_bounds
 from stages.core.kernels.splat.binning import bin_splats, depth_order_reference
 from stages.core.kernels.splat.compositing import composite, composite_reference, composite_with_dominant
 from stages.core.kernels.splat.projection import BIN_SIZE, TILE_SIZE, pack_camera, project, project_reference
-from stages.core.kernels.splat.simd import even_bounds
 from stages.core.kernels.splat.tiles import Capacity, bin_tiles
 from tests.conftest import random_gaussians, ring
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from stages.core.kernels.splat.simd import by_device
+from stages.core.kernels.simd import by_device
 
 
 @wp.struct

@@ -19,7 +19,7 @@ from stages.core.kernels.field.contact_impulses import (
     relative_velocity,
 )
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
-from stages.core.kernels.splat.simd import by_device
+from stages.core.kernels.simd import by_device
 
 f64 = wp.float64
 

@@ -13,8 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view, with_arrays
+from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 from stages.core.kernels.splat.projection import BIN_SIZE
-from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 

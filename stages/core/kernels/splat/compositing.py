@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view
+from stages.core.kernels.simd import VECTORS, launch_ranges, num_threads
 from stages.core.kernels.splat import compositing_cuda
 from stages.core.kernels.splat.binning import BinnedSplats, Bins
 from stages.core.kernels.splat.canvas import Canvas, canvas_over, image_gradients
@@ -25,7 +26,6 @@ from stages.core.kernels.splat.pixel_blocks import (
     PIXELS_PER_BIN,
 )
 from stages.core.kernels.splat.projection import MIN_ALPHA
-from stages.core.kernels.splat.simd import VECTORS, launch_ranges, num_threads
 from stages.core.kernels.splat.tiles import Tiles
 
 _FORWARD = r"""

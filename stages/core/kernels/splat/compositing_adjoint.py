@@ -10,11 +10,11 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view, with_arrays
+from stages.core.kernels.simd import LANE_SUMS, VECTORS, launch_ranges, num_threads
 from stages.core.kernels.splat.binning import BinnedSplats, Bins, SplatOrder
 from stages.core.kernels.splat.canvas import Canvas, ImageGradients
 from stages.core.kernels.splat.pixel_blocks import BIN_BLOCKS, MAX_ALPHA, MIN_MEAN_ALPHA
 from stages.core.kernels.splat.projection import SPLAT_SIZE, SplatGradients
-from stages.core.kernels.splat.simd import LANE_SUMS, VECTORS, launch_ranges, num_threads
 from stages.core.kernels.threads import small_operations
 
 wp.set_module_options({"enable_backward": False})

@@ -12,10 +12,10 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view, with_arrays
+from stages.core.kernels.simd import by_device
 from stages.core.kernels.splat.canvas import Canvas, ImageGradients, canvas_over, image_gradients
 from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_MEAN_ALPHA, MIN_TRANSMITTANCE
 from stages.core.kernels.splat.projection import SPLAT_SIZE, TILE_SIZE, SplatGradients
-from stages.core.kernels.splat.simd import by_device
 from stages.core.kernels.splat.tiles import SlotRanges, TiledSplats, Tiles
 
 wp.set_module_options({"enable_backward": False})

@@ -17,8 +17,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.interop import device_of, launch, view, with_arrays
-from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
-from stages.core.kernels.splat.simd import (
+from stages.core.kernels.simd import (
     LANES,
     SCALARS,
     VECTORS,
@@ -27,6 +26,7 @@ from stages.core.kernels.splat.simd import (
     launch_ranges,
     num_threads,
 )
+from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
 
 wp.set_module_options({"enable_backward": False})  # the adjoint is written out below
 

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import view
+from stages.core.kernels.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
 from stages.core.kernels.splat import ssim_pixel
-from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
 from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS, ImagePair, image_pair
 
 wp.set_module_options({"enable_backward": False})

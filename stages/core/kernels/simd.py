@@ -1,4 +1,4 @@
-"""Types and functions for the C++ snippets of the rasteriser, and their parallel launch on a CPU.
+"""Vector types and functions for C++ snippets in Warp kernels, and their parallel launch on a CPU.
 
 Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets use the
 compiler's vector types, which are lowered to what the processor has (one AVX-512 register, two AVX registers,

@@ -65,9 +65,8 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     steps = StepCache.for_output(out, _cache_key(photos, options), options.resume)
     try:
         made = backend(photos, options, steps)
-        inputs = [Path(imgs), *([options.cameras] if options.cameras else [])]
-        facts = {**provenance("reconstruct", inputs, replace(options, resume=False)), **seconds_since(began),
-                 **made.scene.provenance}  # fmt: skip
+        facts = {**provenance("reconstruct", [imgs], replace(options, resume=False)), **seconds_since(began),
+                 "photos": fingerprint(photos.names, *photos.images), **made.scene.provenance}  # fmt: skip
         write_scene(out, replace(made.scene, provenance=facts, sequence=sequence))
     except InputError:
         steps.remove()

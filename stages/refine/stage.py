@@ -44,7 +44,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
     check_output(Path(out))
     refined = refine(whole, options)
-    facts = {**provenance("refine", [Path(scene)], options), **seconds_since(began), "scene": whole.provenance}
+    facts = {**provenance("refine", [scene], options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))
     psnr = object_psnr(whole, refined, device=device)
     seen = "" if psnr is None else f"; PSNR against the input in the views of the photos {psnr:.1f} dB"

@@ -31,8 +31,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     labelled = rename_objects(segment(whole, options), options)
     reference = parse_object_scale(options.scale_reference)
     labelled = reference.applied(labelled) if reference else labelled
-    inputs = [Path(p) for p in (scene, options.boxes, options.photos) if p is not None]
-    facts = {**provenance("segment", inputs, options), **seconds_since(began), "scene": whole.provenance}
+    facts = {**provenance("segment", [scene], options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))
     log_objects(labelled)
     log.info("%s: %d objects", out, len(labelled.objects))

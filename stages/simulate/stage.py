@@ -58,8 +58,7 @@ def run(
     options = with_engine(options, world, keypoints, prompts)
     prompts = for_engine(prompts, world, options)
     rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
-    inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
-    inputs += segment_files(choose_materials(world.objects, options.material, options.materials))
+    inputs = [scene, *segment_files(choose_materials(world.objects, options.material, options.materials))]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())

@@ -56,7 +56,8 @@ def test_prompts_give_named_objects(scene_file, truth, weights, photos, tmp_path
     assert labelled.objects or device == "cuda"  # in bfloat16 random masks may win no Gaussian
     assert all(o.name == names[o.id - 1] for o in labelled.objects)
     assert set(labelled.gaussians.object_id.unique().tolist()) == {0, *(o.id for o in labelled.objects)}
-    assert [row["name"] for row in labelled.provenance["inputs"]] == ["scene.ply", "p.json", "photos"]
+    inputs = [row["name"] for row in labelled.provenance["inputs"]]
+    assert inputs == ["scene.ply", "p.json", "photos", weights.name]
 
 
 def test_rendered_views_equal_their_photos(truth, photos):

@@ -6,7 +6,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -141,12 +141,16 @@ def seconds_since(began: float) -> dict[str, float]:
     return {"seconds": round(time.monotonic() - began, 1)} if os.environ.get("NGFF_TIMES") else {}
 
 
-def provenance(command: str, inputs: list[Path], options: object = None) -> dict:
-    """Provenance of a file: command, version, inputs with sha256 (of files; folders only by name), options."""
+def provenance(command: str, inputs: Sequence[Path], options: object = None) -> dict:
+    """Provenance of a file: command, version, options, and the inputs, with those that options name.
+
+    Files have their sha256; folders are there by name only.
+    """
     chosen = asdict(options) if is_dataclass(options) else dict(options or {})
+    paths = dict.fromkeys([*map(Path, inputs), *(v for v in chosen.values() if isinstance(v, Path))])
     return {
         "command": command,
         "ngff": ngff_version(),
-        "inputs": [{"name": Path(p).name, **({"sha256": sha256(p)} if Path(p).is_file() else {})} for p in inputs],
+        "inputs": [{"name": p.name, **({"sha256": sha256(p)} if p.is_file() else {})} for p in paths],
         "options": {k: str(v) if isinstance(v, Path) else v for k, v in chosen.items()},
     }

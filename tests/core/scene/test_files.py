@@ -106,11 +106,13 @@ def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported
 
 
 def test_provenance_names_inputs_with_their_hashes_and_options_as_text(tmp_path):
-    (tmp_path / "a.txt").write_bytes(b"abc")
-    facts = files.provenance("ngff x", [tmp_path / "a.txt", tmp_path], {"out": tmp_path, "steps": 3})
-    assert facts["command"] == "ngff x" and facts["options"] == {"out": str(tmp_path), "steps": 3}
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_bytes(b"abc")
+    facts = files.provenance("ngff x", [tmp_path / "a.txt", tmp_path], {"weights": tmp_path / "b.txt", "steps": 3})
+    assert facts["command"] == "ngff x" and facts["options"] == {"weights": str(tmp_path / "b.txt"), "steps": 3}
     digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of FIPS 180-2, B.1
-    assert facts["inputs"] == [{"name": "a.txt", "sha256": digest}, {"name": tmp_path.name}]
+    again = {"name": "b.txt", "sha256": digest}
+    assert facts["inputs"] == [{"name": "a.txt", "sha256": digest}, {"name": tmp_path.name}, again]
     assert files.provenance("x", [])["options"] == {} and facts["ngff"] == files.ngff_version()
     with (tmp_path / "a.txt").open("rb") as file:
         assert files._digest(file) == digest

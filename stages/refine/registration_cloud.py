@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
+from stages.core.geometry.symmetric_matrices import eigh
 from stages.core.scene.gaussians import Gaussians
 
 MAX_RAW_POINTS = 30_000  # that points are smoothed from

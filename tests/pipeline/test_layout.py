@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections import Counter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -20,15 +21,20 @@ def folder(module: str) -> str:
     return ".".join(parts[1:3]) if parts[1] == "core" else parts[1]
 
 
-def imported_folders(tree: ast.Module) -> set[str]:
-    """Folders of all imports of a file, at any level."""
+def imported_modules(tree: ast.Module) -> set[str]:
+    """All imports of a file, at any level: modules, and names in them."""
     names = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-    return {folder(name) for name in names if name.startswith("stages.")}
+    return names
+
+
+def imported_folders(tree: ast.Module) -> set[str]:
+    """Folders of all imports of a file from stages."""
+    return {folder(name) for name in imported_modules(tree) if name.startswith("stages.")}
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +55,22 @@ def test_folders_import_only_from_folders_above_them(trees):
     violations = {module: extra for module, tree in trees.items()
                   if (extra := imported_folders(tree) - allowed_imports(folder(module)))}  # fmt: skip
     assert not violations
+
+
+@pytest.mark.parametrize("home", ["stages.lab", "stages.core.models"])
+def test_no_two_subfolders_import_from_each_other(trees, home):
+    """Nor do three or more in a circle. `home` itself, with the files beside its subfolders, counts as one of them."""
+
+    def part(module: str) -> str:
+        name = module.removeprefix(f"{home}.").split(".")[0]
+        return name if (ROOT / home.replace(".", "/") / name).is_dir() else home
+
+    graph: dict[str, set[str]] = {}
+    for module, tree in trees.items():
+        if module.startswith(f"{home}."):
+            others = {part(name) for name in imported_modules(tree) if name.startswith(f"{home}.")}
+            graph.setdefault(part(module), set()).update(others - {part(module)})
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError
 
 
 def test_no_file_outside_the_list_of_folders(trees):

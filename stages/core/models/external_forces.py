@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.core.models.field.equivariant import symmetric_solve
+from stages.core.geometry.symmetric_matrices import symmetric_solve
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass, inertia
 from stages.core.physics.forces import ForcePrompts
 

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
+from stages.core.geometry.symmetric_matrices import eigh
 
 RESOLUTION = 36  # nodes of the grid along each axis
 MARGIN = 4  # cells of the grid around the body

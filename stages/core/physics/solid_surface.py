@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from stages.core.geometry.eigenvectors import PAIRS, least_directions
+from stages.core.geometry.symmetric_matrices import PAIRS, least_directions
 from stages.core.physics.morphology import surrounded
 from stages.core.physics.particles import filled_voxels, inliers, usable_means
 from stages.core.scene.cached import cached_in_scene

@@ -20,10 +20,10 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
-from stages.lab.dataset.keypoint_motions import KeypointMotions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, read_groups
 from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
 from stages.lab.training.ablation import ABLATIONS, Ablation
-from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, read_groups, train_validation_split
+from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, train_validation_split
 from stages.lab.training.distributed import ProcessGroup
 from stages.lab.training.state import TrainingState
 from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, TrainOptions, validate

@@ -42,8 +42,7 @@ from stages.lab.bench.dynamics_baselines import (
 )
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
 from stages.lab.dataset import sensitivity
-from stages.lab.dataset.keypoint_motions import KeypointMotions
-from stages.lab.training.data import motions_folder, read_groups
+from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_groups
 from stages.lab.training.history import total_minutes
 
 log = logging.getLogger(__name__)

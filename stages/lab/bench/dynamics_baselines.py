@@ -21,11 +21,10 @@ from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.initial_conditions import InitialConditions
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
-from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, motions_folder
 from stages.lab.dataset.object_particles import Asset, Discretisation, load_assets
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
-from stages.lab.training.data import motions_folder
 
 log = logging.getLogger(__name__)
 Predict = Callable[[KeypointMotions], Float[Tensor, "s t o n 3"]]

@@ -211,3 +211,32 @@ def read_motions(path: Path) -> KeypointMotions:
             )  # fmt: skip
     except (KeyError, OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}); {FILE_KIND} is expected") from error
+
+
+def motions_folder(folder: Path) -> Path:
+    """The folder of a data set's motions: its subfolder `motions` if there is one, else the folder itself."""
+    inner = Path(folder) / "motions"
+    return inner if inner.is_dir() else Path(folder)
+
+
+def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> KeypointMotions:
+    """Scenes of NAME.h5 in a folder, with the first `keypoints` of each object.
+
+    Raises InputError for missing files, too few keypoints, and groups of different lengths.
+    """
+    folder = motions_folder(folder)
+    missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]
+    if missing:
+        raise InputError(f"{folder}: there is no {', '.join(missing)}; make the groups with `ngff-lab dataset`, or "
+                         "name those that are there")  # fmt: skip
+    parts = []
+    for name in names:
+        part = read_motions(folder / f"{name}.h5")
+        if part.points.shape[3] < keypoints:
+            raise InputError(f"{folder / name}.h5: has {part.points.shape[3]} keypoints an object; ask for no "
+                             f"more, not {keypoints}")  # fmt: skip
+        parts.append(replace(part, points=part.points[:, :, :, :keypoints].clone()))
+    odd = next((n for n, p in zip(names, parts, strict=True) if p.points.shape[1] != parts[0].points.shape[1]), None)
+    if odd:
+        raise InputError(f"{folder / odd}.h5: has another number of frames than {names[0]}.h5; use groups of one kind")
+    return concatenate_motions(parts)

@@ -30,9 +30,8 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.files import replacing
-from stages.lab.dataset.keypoint_motions import KeypointMotions, read_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_motions
 from stages.lab.dataset.layout import object_kind
-from stages.lab.training.data import motions_folder
 
 FALL_HEIGHT, CONTACT_DISTANCE, REST_SPEED = 0.05, 0.04, 0.05  # [m], [m], [m/s]
 TIP_ANGLE = 30.0  # [deg]

@@ -18,8 +18,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import replacing
 from stages.evaluate.dynamics import all_metrics
-from stages.lab.dataset.keypoint_motions import KeypointMotions
-from stages.lab.training.data import motions_folder, read_groups
+from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_groups
 
 TRAINED = tuple(f"3_{i}" for i in range(9))
 SPLITS = {  # groups of scenes, and frames that are compared

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import sha256
-from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, read_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder
 
 VALIDATION_SCENES = 100  # at the end of the last group: they only select the best weights
 # RMS change of velocity from frame to frame [m/s] above which an object is in a collision, where central differences
@@ -34,35 +34,6 @@ class MotionClip:
     speed: Float[Tensor, "b o n 3"]  # their velocities [m/s]
     truth: Float[Tensor, "b t o n 3"]  # keypoints in the frames after the start [m]
     spread: Float[Tensor, "b o 3"]  # RMS distance of an object's points from their mean over the whole motion [m]
-
-
-def motions_folder(folder: Path) -> Path:
-    """The folder of a data set's motions: its subfolder `motions` if there is one, else the folder itself."""
-    inner = Path(folder) / "motions"
-    return inner if inner.is_dir() else Path(folder)
-
-
-def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> KeypointMotions:
-    """Scenes of NAME.h5 in a folder, with the first `keypoints` of each object.
-
-    Raises InputError for missing files, too few keypoints, and groups of different lengths.
-    """
-    folder = motions_folder(folder)
-    missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]
-    if missing:
-        raise InputError(f"{folder}: there is no {', '.join(missing)}; make the groups with `ngff-lab dataset`, or "
-                         "name those that are there")  # fmt: skip
-    parts = []
-    for name in names:
-        part = read_motions(folder / f"{name}.h5")
-        if part.points.shape[3] < keypoints:
-            raise InputError(f"{folder / name}.h5: has {part.points.shape[3]} keypoints an object; ask for no "
-                             f"more, not {keypoints}")  # fmt: skip
-        parts.append(replace(part, points=part.points[:, :, :, :keypoints].clone()))
-    odd = next((n for n, p in zip(names, parts, strict=True) if p.points.shape[1] != parts[0].points.shape[1]), None)
-    if odd:
-        raise InputError(f"{folder / odd}.h5: has another number of frames than {names[0]}.h5; use groups of one kind")
-    return concatenate_motions(parts)
 
 
 def train_validation_split(motions: KeypointMotions, count: int) -> tuple[KeypointMotions, KeypointMotions]:

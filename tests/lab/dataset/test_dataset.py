@@ -15,7 +15,13 @@ from stages.core.errors import InputError
 from stages.core.physics.mpm.solver import SAFETY, wave_speed
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.dataset import generate, object_particles
-from stages.lab.dataset.keypoint_motions import POSITION_STEP, concatenate_motions, read_motions, write_motions
+from stages.lab.dataset.keypoint_motions import (
+    POSITION_STEP,
+    concatenate_motions,
+    read_groups,
+    read_motions,
+    write_motions,
+)
 from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
 from stages.lab.dataset.options import DatasetOptions
 from stages.lab.dataset.scene_configs import (
@@ -30,7 +36,6 @@ from stages.lab.dataset.scene_configs import (
     write_scene_configs,
 )
 from stages.lab.dataset.simulation import SimulationSettings, simulate, simulation_batches, stable_substep
-from stages.lab.training.data import read_groups
 from tests.lab.assets.test_objects import full_size
 from tests.lab.small_world import COARSE, box_shell
 

@@ -19,12 +19,8 @@ from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import build, load
 from stages.core.scene.files import sha256
-from stages.lab.dataset.keypoint_motions import write_motions
-from stages.lab.training.data import (
-    ClipSampler,
-    read_groups,
-    train_validation_split,
-)
+from stages.lab.dataset.keypoint_motions import read_groups, write_motions
+from stages.lab.training.data import ClipSampler, train_validation_split
 from stages.lab.training.rollout_loss import RolloutLoss
 from stages.lab.training.state import GRADIENT_CLIP, OPTIMIZERS, WARMUP_STEPS, TrainingState, _optimizer
 from stages.lab.training.train import TrainOptions, run, validate

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.core.geometry.symmetric_matrices import symmetric_solve
 from stages.core.models.dynamics import FRAME
 from stages.core.models.field.contact_forces import ContactPoints, at_contacts
-from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm, symmetric_solve
+from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.field.rest_shape import RestShape
 

@@ -48,14 +48,6 @@ def matvec(M: Float[Tensor, "*#b 3 3"], x: Float[Tensor, "*#b 3"]) -> Float[Tens
     return (M * x[..., None, :]).sum(-1)
 
 
-def symmetric_solve(M: Float[Tensor, "*b 3 3"], *x: Float[Tensor, "*b 3"]) -> list[Float[Tensor, "*b 3"]]:
-    """M^-1 x for each x by Cramer's rule; unlike torch.linalg.solve it can be captured in a CUDA graph."""
-    a, b, c = M.unbind(-2)
-    ab, bc, ca = torch.linalg.cross(a, b), torch.linalg.cross(b, c), torch.linalg.cross(c, a)
-    det = (a * bc).sum(-1, keepdim=True)
-    return [(v[..., :1] * bc + v[..., 1:2] * ca + v[..., 2:] * ab) / det for v in x]
-
-
 def smooth_norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """sqrt(|x|^2 + 1e-12): the norm, differentiable at zero."""
     return (x.square().sum(-1) + 1e-12).sqrt()

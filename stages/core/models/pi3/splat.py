@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.rotations import multiply, quaternion
+from stages.core.geometry.symmetric_matrices import eigh
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.feature_head import FeatureHead
 from stages.core.models.pi3.network import CAMERA_REGISTERS, Geometry, Pi3, by_views

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
+from stages.core.geometry.symmetric_matrices import eigh
 from stages.core.scene.gaussians import SURFACE_OPACITY
 
 VOXEL = 0.01  # side [camera distance]

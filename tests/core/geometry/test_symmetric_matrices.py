@@ -1,10 +1,10 @@
-"""Eigenvectors of many small symmetric matrices."""
+"""Eigenvectors of many small symmetric matrices, and solutions of systems of equations."""
 
 import numpy as np
 import pytest
 import torch
 
-from stages.core.geometry.eigenvectors import BATCH, PAIRS, eigh, least_directions
+from stages.core.geometry.symmetric_matrices import BATCH, PAIRS, eigh, least_directions, symmetric_solve
 
 
 def test_more_matrices_than_the_solver_takes_at_once(device):
@@ -34,3 +34,11 @@ def test_least_directions_are_those_of_lapack(eigenvalues):
     np.testing.assert_allclose(quotient, values[:, 0], atol=1e-14 * max(eigenvalues))
     if eigenvalues[1] - eigenvalues[0] > 0.1 * max(eigenvalues):
         np.testing.assert_allclose(np.abs((found * vectors[:, :, 0]).sum(1)), 1, atol=1e-13)
+
+
+def test_symmetric_solve_equals_linalg_solve():
+    rng = torch.Generator().manual_seed(0)
+    root = torch.randn(2, 5, 3, 3, generator=rng, dtype=torch.float64)
+    M, x, y = root @ root.mT + 0.1 * torch.eye(3), *torch.randn(2, 2, 5, 3, generator=rng, dtype=torch.float64)
+    for solution, b in zip(symmetric_solve(M, x, y), (x, y), strict=True):
+        assert_close(solution, torch.linalg.solve(M, b[..., None])[..., 0])

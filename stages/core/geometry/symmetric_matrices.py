@@ -1,4 +1,4 @@
-"""Eigenvectors of many small symmetric matrices."""
+"""Eigenvectors of many small symmetric matrices, and solutions of systems of equations."""
 
 from __future__ import annotations
 
@@ -45,3 +45,11 @@ def least_directions(matrices: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n
     unclear = length <= UNCLEAR * size**2  # both lesser eigenvalues are about equal
     out[unclear] = np.linalg.eigh(matrices[unclear][:, FULL].reshape(-1, 3, 3))[1][:, :, 0]
     return out
+
+
+def symmetric_solve(M: Float[Tensor, "*b 3 3"], *x: Float[Tensor, "*b 3"]) -> list[Float[Tensor, "*b 3"]]:
+    """M^-1 x for each x by Cramer's rule; unlike torch.linalg.solve it can be captured in a CUDA graph."""
+    a, b, c = M.unbind(-2)
+    ab, bc, ca = torch.linalg.cross(a, b), torch.linalg.cross(b, c), torch.linalg.cross(c, a)
+    det = (a * bc).sum(-1, keepdim=True)
+    return [(v[..., :1] * bc + v[..., 1:2] * ca + v[..., 2:] * ab) / det for v in x]

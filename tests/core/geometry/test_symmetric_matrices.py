@@ -41,4 +41,4 @@ def test_symmetric_solve_equals_linalg_solve():
     root = torch.randn(2, 5, 3, 3, generator=rng, dtype=torch.float64)
     M, x, y = root @ root.mT + 0.1 * torch.eye(3), *torch.randn(2, 2, 5, 3, generator=rng, dtype=torch.float64)
     for solution, b in zip(symmetric_solve(M, x, y), (x, y), strict=True):
-        assert_close(solution, torch.linalg.solve(M, b[..., None])[..., 0])
+        torch.testing.assert_close(solution, torch.linalg.solve(M, b[..., None])[..., 0])

@@ -9,7 +9,7 @@
 Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with values of each or all; set `.v`, `.held`
 and `.model` afterwards, and join bodies with `solver.join_particles`. The caller keeps track of which body a particle
 belongs to: rows keep their order. Scenes have the same box, spacing, substep and colliders. On a GPU a scene takes
-about 52 bytes per node of the box, active or not, and 500 per particle: `Batch.fits` computes how many scenes fit.
+about 52 bytes per node of the box, active or not, and 700 per particle: `Batch.fits` computes how many scenes fit.
 
 `batch.solver.substeps(duration, acceleration)` is the number of substeps by the CFL condition; fewer may diverge. With
 the schedule `exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, at about twice

@@ -185,7 +185,7 @@ class Solver:
         if sum(sizes) != len(particles) or min(sizes) < 1:
             raise ValueError(f"{len(particles)} particles cannot be split into scenes of {sizes}")
         if len(sizes) * self.grid.count * (2 if exact else 1) > max_batch_nodes(device):
-            raise ValueError(f"{len(sizes)} grids of {self.grid.count} nodes each are too large")
+            raise ValueError(f"{len(sizes)} grids of {self.grid.count} nodes each are too many")
         columns = {f.name: getattr(particles, f.name) for f in fields(Particles)}
         self.rows = ParticleRows(columns, sizes, self.grid, device)
         self.colliders = options.colliders

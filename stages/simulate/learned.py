@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.models import checkpoints as weights
+from stages.core.models import checkpoints
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.force_field import ForceField
@@ -77,7 +77,7 @@ def rollout(
 ) -> Iterator[FrameState]:
     """One state per frame, the first being the start. Raises InputError when the motion is no longer finite."""
     device = pick_device(options.device)
-    model, card = weights.load(weights.find(ENGINES[options.engine].weights, options.weights), device)
+    model, card = checkpoints.load(checkpoints.find(ENGINES[options.engine].weights, options.weights), device)
     if card.get("warning"):
         log.warning("%s", card["warning"])
     setup = set_up_scene(scene, prompts, options)
@@ -235,9 +235,9 @@ def _floor_heights(
     return torch.where(standing, ends, usual.minimum(ends))
 
 
-def _model_stiffness(o: SceneObject, E: float, solidity: float) -> float:
+def _model_stiffness(o: SceneObject, E: float, ratio: float) -> float:
     """Young's modulus [Pa], at least that which makes the body as stiff as the softest in training."""
-    bounded = max(E, MIN_STIFFNESS / solidity)
+    bounded = max(E, MIN_STIFFNESS / ratio)
     if bounded / 2 > E:
         log.warning("object %d (%s): %.2g Pa (at this size) is softer than bodies of its thickness in training; "
                     "taking %.2g Pa, compare with --engine mpm", o.id, o.name, E, bounded)  # fmt: skip

@@ -1,13 +1,14 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
-penetration: deepest keypoint of an object inside another one or below the floor (with an engine that ends the table:
-inside it, from its top or its sides), beyond the depth at rest and the one to which --lift put it there, of which a
-warning tells, relative to the smaller height of both. A keypoint outside its own mean surface, by noise or as a
-floater, counts by so much less; in other objects, so does one below the floor at rest, where bodies end.
-creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
+penetration: depth of the deepest keypoint of an object in another object or below the floor, relative to the smaller
+height of the two. With an engine whose table has edges: in the table, from its top or its sides. The depth in the
+scene at rest is subtracted, and so is one that --lift causes, which has a warning of its own. The distance of a
+keypoint from the mean surface of its own object (noise, floaters) is subtracted too, and in other objects its depth
+below the floor at rest, where bodies are cut off.
+creep: speed of an object in the last quarter of the time, if it is slow in all of that quarter [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
-energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
-energy that was converted. Bodies turn as filled ones, whose mass their keypoints, on the surface, do not show.
+energy_gain: largest increase of the mechanical energy of all objects above that at the start, or after the last force,
+relative to the energy that was converted. The inertia is that of the filled bodies, since keypoints are on surfaces.
 """
 
 from __future__ import annotations

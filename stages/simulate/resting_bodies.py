@@ -79,7 +79,7 @@ class RestingBodies:
     def release_disturbed(self, data) -> list[int]:
         """Release the bodies that the contact forces of a substep would move; returns them.
 
-        Those forces are on bodies that were held: they are to be found again if there are any.
+        If any are released, the contact forces must be computed again, since these bodies now move.
         """
         if not self.held.any():
             return []
@@ -121,8 +121,8 @@ def excess_force(
     load = weight - wrench[:, 2]
     push = np.hypot(wrench[:, 0], wrench[:, 1])
     moment = np.hypot(wrench[:, 3] - height * wrench[:, 1], wrench[:, 4] + height * wrench[:, 0])
-    grip = np.maximum(load, 0)
-    excess = np.maximum(push - friction * grip, (moment - half_width * grip) / height)
+    pressing = np.maximum(load, 0)
+    excess = np.maximum(push - friction * pressing, (moment - half_width * pressing) / height)
     return np.maximum(excess, -load)
 
 

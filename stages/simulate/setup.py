@@ -192,7 +192,7 @@ def held_as_seen(scene: Scene, options: SimulateOptions) -> bool:
 
 
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
-    """Log that a scene of photos has no unseen sides, if none were added."""
+    """Log that the sides that no photo shows are missing, unless `ngff refine` has added them."""
     if from_photos(scene) and "refine" not in scene.commands:
         log.info("%s: the sides that no photo shows are missing, so that objects may be too light and hollow; "
                  "`ngff refine` adds them", path)  # fmt: skip

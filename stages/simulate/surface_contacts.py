@@ -187,7 +187,7 @@ class SurfaceContacts:
         add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], excess[k], geoms))
 
     def exclude(self, data) -> None:
-        """Exclude the contacts of hulls that surfaces replace."""
+        """Exclude the contacts between hulls for which there are contacts between surfaces."""
         replaced = self.replaced(data.contact.geom)
         data.contact.exclude[replaced] = 1
         data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts

@@ -69,7 +69,7 @@ class TableEdges:
         return corners[edges] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
 
     def _on_edges(self, ends: np.ndarray, sunk: float) -> list[np.ndarray]:
-        """Of the points where edges (e, 2, 3) cross those of the table and are deeper than `sunk`, the outer ones."""
+        """The outermost points at which edges (e, 2, 3) of a body cross edges of the table at a depth above `sunk`."""
         found = []
         side = ends[..., :2] @ self._outline.normals.T - self._outline.offsets  # (e, 2, k)
         for k in np.flatnonzero((side < 0).any((0, 1)) & (side > 0).any((0, 1))):

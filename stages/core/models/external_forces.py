@@ -85,8 +85,8 @@ class ExternalForces:
         arm = points[scene, self.object, self.point.clamp_min(0)] - com[scene, self.object]
         torque = torque + torch.where(self.point[..., None] >= 0, torch.linalg.cross(arm, force), 0.0)
         row = self.object[..., None].expand_as(force)
-        none_for = torch.zeros_like(com)
-        return none_for.scatter_add(1, row, force), none_for.scatter_add(1, row, torque)
+        zero = torch.zeros_like(com)
+        return zero.scatter_add(1, row, force), zero.scatter_add(1, row, torque)
 
     def acceleration(
         self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], t: Tensor | float, dt: float = 0.0

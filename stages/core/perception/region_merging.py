@@ -162,7 +162,7 @@ class RegionMerger:
             self.borders[x][y] = self.borders[y][x] = Border(int(n), float(c), float(v))
 
     def separation(self, a: int, b: int) -> float:
-        """Dissimilarity of two neighbouring regions: well below 1/3 they are one object, well above it two.
+        """Dissimilarity of two neighbouring regions; below `GroupingOptions.detail` they are merged.
 
         It increases with a concave boundary, with a union less convex than its parts, with a narrow boundary, and
         with different colours, which count less where the union is convex. It decreases where one region lies in the

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.models import checkpoints as weights
+from stages.core.models import checkpoints
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.rollout import TimeStepper, record_frames
 from stages.core.scene.files import must_exist
@@ -207,7 +207,7 @@ def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchO
 
 
 def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
-    model, card = weights.load(file, device)
+    model, card = checkpoints.load(file, device)
     learned = card.get("options", {}).get("keypoints", options.keypoints)  # it was not trained with more
     splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
     with torch.inference_mode():

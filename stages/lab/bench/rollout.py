@@ -24,7 +24,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.models import checkpoints as weights
+from stages.core.models import checkpoints
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper, record_frames
@@ -65,9 +65,9 @@ def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
 def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iterator[str]:
     """Yield the lines of the report; results go to the JSON file `out`, which keeps those of other devices."""
     device = pick_device(options.device)
-    model, card = weights.load(weights.find("ngff", options.weights), device)
+    model, card = checkpoints.load(checkpoints.find("ngff", options.weights), device)
     torch.manual_seed(0)
-    paper = weights.build("ngff-paper").to(device).eval()  # untrained: a step takes the same time
+    paper = checkpoints.build("ngff-paper").to(device).eval()  # untrained: a step takes the same time
     yield bench.machine(device)
     facts = {
         "machine": bench.machine(device), "threads": torch.get_num_threads(),

@@ -86,7 +86,7 @@ class FilmProblem(Problem):
 
     @property
     def observations(self) -> float:
-        """Number of blocks of pixels."""
+        """Number of observations with independent noise: blocks of pixels."""
         return sum(int(p.window.sum()) for p in self.pictures) / self._block
 
     @property

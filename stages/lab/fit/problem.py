@@ -75,7 +75,7 @@ class Problem:
 
     @property
     def observations(self) -> float:
-        """How many there are whose noise is independent: frames."""
+        """Number of observations with independent noise: the frames."""
         return len(self.track)
 
     @property

@@ -121,13 +121,13 @@ class RolloutLoss:
         scene = replace_tensors(scene, iter(leaves))
         # with gradients, so that the first step is like the others to a compiler
         state = replace_tensors(state, (x.detach().requires_grad_() for x in leaf_tensors(state)))
-        pushes = ExternalForces.none_for(valid, truth)
+        external = ExternalForces.none_for(valid, truth)
         frames = []
         for _ in range(truth.shape[1]):
             state = replace_tensors(
                 state, (torch.lerp(x.detach(), x, options.gradient_discount) for x in leaf_tensors(state))
             )
-            moved = self.advance(self.model, scene, state, self.dt, pushes, options.velocity_time > 0)
+            moved = self.advance(self.model, scene, state, self.dt, external, options.velocity_time > 0)
             state = replace_tensors(state, iter(moved))
             frames.append(moved[len(state) :])
         points, *speed = (torch.stack(x, 1) for x in zip(*frames, strict=True))
@@ -183,14 +183,14 @@ class RolloutLoss:
 
 
 def _advance(
-    model: Dynamics, scene: Any, state: tuple, dt: float, pushes: ExternalForces, speeds: bool
+    model: Dynamics, scene: Any, state: tuple, dt: float, external: ExternalForces, speeds: bool
 ) -> tuple[Tensor, ...]:
     """The tensors of the next state, its keypoints and, with `speeds`, their velocities. Time only matters to forces.
 
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
     """
-    state = model.step(scene, state, 0.0, dt, pushes)
-    return (*state, model.points(scene, state), *([model.point_velocity(scene, state, pushes)] if speeds else []))
+    state = model.step(scene, state, 0.0, dt, external)
+    return (*state, model.points(scene, state), *([model.point_velocity(scene, state, external)] if speeds else []))
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

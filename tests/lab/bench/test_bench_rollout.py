@@ -27,9 +27,9 @@ def test_run_has_all_rows_and_keeps_those_of_another_device(tmp_path, monkeypatc
     torch.manual_seed(0)
     save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))
     small = build("ngff-paper", hidden=8, layers=1)
-    monkeypatch.setattr(bench_rollout.weights, "build", lambda name: small)
+    monkeypatch.setattr(bench_rollout.checkpoints, "build", lambda name: small)
     ours = build("ngff", hidden=8).to(device).eval()
-    monkeypatch.setattr(bench_rollout.weights, "load", lambda path, device: (ours, {"sha256": "x"}))
+    monkeypatch.setattr(bench_rollout.checkpoints, "load", lambda path, device: (ours, {"sha256": "x"}))
     monkeypatch.setattr(bench_rollout.bench_mpm, "measure", lambda *a: {"particles": 30, "substep_us": 2.0})
     out = tmp_path / "rollout.json"
     out.write_text(json.dumps({"another": {"machine": "a large one"}}))

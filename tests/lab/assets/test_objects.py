@@ -85,13 +85,13 @@ def mean_colour(g: Gaussians, mask: torch.Tensor) -> list[float]:
     return (g.sh[mask, 0].mean(0) * C0 + 0.5).tolist()
 
 
-def test_registry_holds_the_published_ids_scales_and_materials(made_of_few):
+def test_registry_holds_the_published_ids_scales_and_materials():
     rows = {o.id: (o.name, o.scale, o.E, o.density) for o in OBJECTS.values()}
     assert sorted(rows) == [0, 2, 3, 4, 7, 9, 10, 11, 12, 14]
     assert rows[11] == ("phone", 0.4, 2e7, 2600.0)
     assert rows[7] == ("duck", 0.3, 3e5, 300.0)
     assert OBJECTS["cloth"].prompt == "a yellow t-shirt with an owl"
-    can = make_object("can").means
+    can = full_size("can").means
     assert (can.amax(0) - can.amin(0)).max() == pytest.approx(0.4)
 
 
@@ -154,9 +154,13 @@ def made_of_few(monkeypatch):
     def few(parts, half_extent, count, **how):
         return gaussians_from_parts(parts, half_extent, count // 6, **how)
 
-    for module in (hard_objects, phone):
-        monkeypatch.setattr(module, "gaussians_from_parts", few)
-    return lambda name: scaled(name, make_object(name))
+    def make(name: str) -> Gaussians:
+        with monkeypatch.context() as patch:  # ends here: `made` keeps what it makes
+            for module in (hard_objects, phone):
+                patch.setattr(module, "gaussians_from_parts", few)
+            return scaled(name, make_object(name))
+
+    return make
 
 
 def test_bowl_is_open_above(made_of_few):

@@ -42,16 +42,21 @@ def kernel_device(tensor: torch.Tensor) -> torch.device:
     return tensor.device if possible else torch.device("cuda")
 
 
+def _require_compiler(tensor: torch.Tensor) -> None:
+    """Raise MissingPackage for a tensor on the CPU where no kernel can be compiled for it."""
+    _ready()
+    if not (tensor.is_cuda or compiles_for_cpu()):
+        raise MissingPackage("Warp has no compiler for the CPU here (its library warp-clang is missing); install it "
+                             "with `pip install --force-reinstall warp-lang`, or use a GPU")  # fmt: skip
+
+
 def view(tensor: torch.Tensor, dtype=None) -> wp.array:
     """Wrap a tensor as a Warp array over the same memory (no copy, no gradient), for a kernel on its device.
 
     `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix. Raises MissingPackage
     for a tensor on the CPU where no kernel can be compiled for it.
     """
-    _ready()
-    if not (tensor.is_cuda or compiles_for_cpu()):
-        raise MissingPackage("Warp has no compiler for the CPU here (its library warp-clang is missing); install it "
-                             "with `pip install --force-reinstall warp-lang`, or use a GPU")  # fmt: skip
+    _require_compiler(tensor)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
@@ -95,8 +100,23 @@ def empty_arrays(struct, device: str, shape: tuple[int, ...], **other: tuple[int
 
 
 def with_arrays(struct, tensors: Mapping[str, torch.Tensor]):
-    """The instance of a Warp struct with these contiguous tensors as arrays, 64-bit integers as 32-bit ones."""
+    """The instance of a Warp struct with these tensors as arrays, contiguous and 64-bit integers as 32-bit ones.
+
+    The struct gets Warp's array descriptors, not `wp.array` objects, which take four times as long to make; its
+    attributes are the tensors, which keeps their memory. A struct within another one is filled in place, as
+    `with_arrays(outer.inner, ...)`. Raises TypeError for a tensor of another type or number of dimensions.
+    """
+    fields, native = struct._cls.vars, struct.__ctype__()
     for name, x in tensors.items():
-        x = x.int() if x.dtype == torch.int64 else x
-        setattr(struct, name, view(x.contiguous(), struct._cls.vars[name].type.dtype))
+        _require_compiler(x)
+        x = (x.int() if x.dtype == torch.int64 else x).detach().contiguous()
+        array = fields[name].type
+        try:
+            descriptor = wp.from_torch(x, array.dtype, requires_grad=False, return_ctype=True)
+        except RuntimeError as e:
+            raise TypeError(f"{name}: {e}") from e
+        if descriptor.ndim != array.ndim:
+            raise TypeError(f"{name} has {descriptor.ndim} dimensions of {array.dtype.__name__}, not {array.ndim}")
+        setattr(native, name, descriptor)
+        vars(struct)[name] = x
     return struct

@@ -1,12 +1,55 @@
-"""Warp without its compiler for the CPU."""
+"""Structs of tensors for kernels, and Warp without its compiler for the CPU."""
 
 import pytest
 import torch
+import warp as wp
 
 from stages.core.errors import MissingPackage
 from stages.core.kernels import interop
 from stages.core.kernels.skinning import skin_gaussians
 from tests.core.kernels.test_skinning import random_inputs
+
+
+@wp.struct
+class Points:
+    at: wp.array2d[wp.vec3]
+    owner: wp.array[int]
+
+
+@wp.struct
+class Cloud:
+    points: Points
+
+
+@wp.kernel(enable_backward=False)
+def _first_of_owner(cloud: Cloud, first: wp.array[wp.vec3]):
+    i = wp.tid()
+    first[i] = cloud.points.at[cloud.points.owner[i], 0]
+
+
+def test_kernels_read_tensors_that_are_not_contiguous_and_long_integers_in_nested_structs(device):
+    cloud, at = Cloud(), torch.arange(24.0, device=device).view(2, 4, 3).transpose(0, 1)
+    owner, first = torch.tensor([2, 0, 3], device=device), torch.zeros(3, 3, device=device)
+    interop.with_arrays(cloud.points, {"at": at, "owner": owner})
+    inputs = [cloud, interop.view(first, wp.vec3)]
+    interop.launch(_first_of_owner, 3, inputs, device=interop.device_of(first))
+    assert torch.equal(first, at[owner, 0])
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [({"at": torch.zeros(5, 3)}, "at has 1 dim"), ({"at": torch.zeros(5, 3, 2)}, "shape"),
+     ({"owner": torch.zeros(5)}, "owner: Cannot convert")],
+)  # fmt: skip
+def test_tensors_that_do_not_match_a_field_are_errors(tensors, message):
+    with pytest.raises(TypeError, match=message):
+        interop.with_arrays(Points(), tensors)
+
+
+def test_a_struct_of_tensors_is_not_copied_into_another_without_its_arrays():
+    points = interop.with_arrays(Points(), {"owner": torch.zeros(3, dtype=torch.int32)})
+    with pytest.raises(TypeError, match="owner"):
+        Cloud().points = points
 
 
 def test_missing_compiler_is_reported_by_every_kernel_on_the_cpu(monkeypatch):

@@ -31,7 +31,6 @@ from stages.core.kernels.field.contact_search import (
     CollisionWorld,
     Found,
     NearPoint,
-    SurfaceArrays,
     contact_in_slot,
     search,
 )
@@ -232,7 +231,7 @@ class RigidFrames:
         samples = surfaces["samples"].shape[1]
         slots, each = (b, o * o * SLOTS), (b, o * o, samples)
         self.world = CollisionWorld()
-        self.world.surfaces = with_arrays(SurfaceArrays(), surfaces)
+        with_arrays(self.world.surfaces, surfaces)
         self.world.motion = empty_arrays(BodyMotion, device, (b, o), low=None, high=None, pinned=None)
         self.world.found = empty_arrays(
             Found, device, (b, o * o), score=slots, row=slots, side=each, gap=each, other=each, near=each

@@ -116,8 +116,8 @@ class _Loss(torch.autograd.Function):
         x, device, shape = rgb.flatten(1).contiguous(), device_of(rgb), rgb.shape
         image, photo, v_rgb, v_depth = torch.empty_like(x), torch.empty_like(x), torch.empty_like(x), depth.clone()
         render = with_arrays(RenderedPhoto(), {"rgb": x, "gain": gain, "depth": depth, "alpha": alpha})
-        launch(_expose, x.shape, [render.rgb, render.gain, view(target.photo.flatten(1))], [view(image), view(photo)],
-               device)  # fmt: skip
+        inputs = [view(x), view(gain), view(target.photo.flatten(1))]
+        launch(_expose, x.shape, inputs, [view(image), view(photo)], device)
         ssim_map, derivatives = ssim_forward(image.view(shape), photo.view(shape))
         ssim_grads = ssim_backward(image.view(shape), photo.view(shape), derivatives).flatten(1)
         sums = depth.new_empty(*depth.shape, 4)

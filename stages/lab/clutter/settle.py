@@ -45,8 +45,9 @@ def settle(furniture: Furniture, hulls: list[list[np.ndarray]], starts: np.ndarr
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for block in furniture.blocks:
         spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half, pos=block.centre, friction=[0.8, 0.01, 0.001]
-        )
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half, pos=block.centre, quat=block.quaternion(),
+            friction=[0.8, 0.01, 0.001],
+        )  # fmt: skip
     for i, drape in enumerate(furniture.drapes):
         top = float(drape.heights.max())
         spec.add_hfield(name=f"d{i}", size=[*drape.half, top, 0.05], nrow=len(drape.heights), ncol=len(drape.heights),

@@ -1,10 +1,10 @@
-"""Furniture and rooms of clutter scenes: boxes with painted faces that are not objects."""
+"""Furniture and rooms of clutter scenes, made of painted boxes: tables, seats, floors, walls, shelves; no objects."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,24 +13,40 @@ from torch import Tensor
 
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.lab.assets import background_paint as paint
-from stages.lab.assets.shapes import box, noise, to_gaussians
+from stages.lab.assets.shapes import Surface, box, noise, to_gaussians
 from stages.lab.clutter.drapes import Drape
 from stages.lab.clutter.props import random_colour, random_paint
 
 Rng = np.random.Generator
 SPACING, COARSE = 0.008, 0.035  # of Gaussians on faces near the objects, and on the room [camera distance]
 MAT_SHARE = 0.5  # of scenes with mats
+SEAT_SHARE = 0.25  # of scenes on a chair, bench or sofa
+NEARBY_SHARE = 0.4  # of scenes with other furniture behind
+FRONT = 1.1 * math.pi, 1.9 * math.pi  # range of azimuths [rad]
 PATTERNS = (paint.oak, paint.marble, paint.gingham, paint.flagstones, paint.worn_paint, paint.slate, paint.azulejo,
             paint.felt, paint.wooden_floor, paint.dark_floor, paint.bricks, paint.garden)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StaticBox:
-    """A box that stands still, its sides parallel to the axes."""
+    """A box that stands still."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
     spacing: float = SPACING
+    yaw: float = 0.0  # about z [rad], after
+    tilt: float = 0.0  # about x [rad]
+    paint: int | None = None  # boxes of one number look alike; None: like no other
+
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        """From the box to the scene."""
+        (a, b), (c, s) = ((math.cos(x), math.sin(x)) for x in (self.yaw, self.tilt))
+        return torch.tensor([[a, -b, 0], [b, a, 0], [0, 0, 1]]) @ torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The same as a quaternion w x y z."""
+        (a, b), (c, s) = ((math.cos(x / 2), math.sin(x / 2)) for x in (self.yaw, self.tilt))
+        return a * c, a * s, b * s, b * c
 
 
 @dataclass(frozen=True)
@@ -41,6 +57,7 @@ class Furniture:
     areas: list[tuple[float, float, float, float, float]]  # x0 x1 y0 y1 z of each surface that things stand on
     open_sides: tuple[float, float]  # range of azimuths without walls [rad]
     drapes: tuple[Drape, ...] = ()  # on the first area
+    back: float = 1.0  # y behind it
 
     def rise(self, low: tuple[float, float], high: tuple[float, float]) -> float:
         """The highest that a drape is in a rectangle of the first area."""
@@ -49,7 +66,21 @@ class Furniture:
 
 
 def random_furniture(rng: Rng) -> Furniture:
-    """A table or a stretch of floor, its top at z = 0; in some scenes with walls, a partition or a shelf."""
+    """A table, a seat or a stretch of floor, its top at z = 0; in some scenes with walls, a partition or a shelf."""
+    made = _seat(rng) if rng.uniform() < SEAT_SHARE else _table(rng)
+    if rng.uniform() < NEARBY_SHARE:
+        made = replace(made, blocks=made.blocks + _nearby(made.back, rng), open_sides=_narrowed(made.open_sides))
+    x, y = made.areas[0][1], made.areas[0][3]
+    mats = [_mat((x, y), rng) for _ in range(rng.integers(1, 5) if rng.uniform() < MAT_SHARE else 0)]
+    return replace(made, blocks=made.blocks + mats)
+
+
+def _narrowed(sides: tuple[float, float]) -> tuple[float, float]:
+    """The front of what could be seen from all sides."""
+    return FRONT if sides[0] == 0 else sides
+
+
+def _table(rng: Rng) -> Furniture:
     on_floor = rng.uniform() < 0.2
     a, b = (2.5, 2.5) if on_floor else (rng.uniform(0.45, 1.2), rng.uniform(0.35, 0.8))
     blocks, used = [], (min(a, rng.uniform(0.4, 0.75)), min(b, rng.uniform(0.3, 0.6)))
@@ -57,18 +88,18 @@ def random_furniture(rng: Rng) -> Furniture:
         blocks.append(StaticBox((0, 0, -0.05), (a, b, 0.05), 1.6 * SPACING))
     else:
         thick, height = rng.uniform(0.015, 0.05), rng.uniform(0.4, 0.8)
-        blocks.append(StaticBox((0, 0, -thick), (a, b, thick)))
-        leg = (0.03, 0.03, height / 2 - thick)
-        blocks += [StaticBox((sx * 0.9 * a, sy * 0.85 * b, -thick - height / 2), leg, COARSE)
-                   for sx in (-1, 1) for sy in (-1, 1)]  # fmt: skip
-        blocks.append(StaticBox((0, 0, -height - 0.05), (4, 4, 0.05), COARSE))
+        blocks += [
+            StaticBox((0, 0, -thick), (a, b, thick)),
+            *_legs(0.9 * a, 0.85 * b, 2 * thick, height),
+            _floor(height),
+        ]
     areas = [(-used[0], used[0], -used[1], used[1], 0.0)]
     sides, back = (0.0, 2 * math.pi), used[1] + rng.uniform(0.06, 0.2) if on_floor else b
     low = 0.0 if on_floor else -0.6
     if rng.uniform() < 0.35:  # a wall behind, in half of the scenes one at the side too
         gap = rng.uniform(0.0, 0.06)
         blocks.append(StaticBox((0, back + gap + 0.03, low + 1.0), (3.5, 0.03, 1.2), COARSE / 1.5))
-        sides = (1.1 * math.pi, 1.9 * math.pi)
+        sides = FRONT
         if rng.uniform() < 0.4:
             blocks.append(StaticBox((a + gap + 0.03, 0, low + 1.0), (0.03, 3.5, 1.2), COARSE / 1.5))
             sides = (1.1 * math.pi, 1.45 * math.pi)
@@ -76,17 +107,75 @@ def random_furniture(rng: Rng) -> Furniture:
         blocks.append(
             StaticBox((0, back - 0.02, 0.2), (min(a, 1.2), rng.uniform(0.01, 0.02), rng.uniform(0.12, 0.25)), SPACING)
         )
-        sides = (1.1 * math.pi, 1.9 * math.pi) if sides[0] == 0 else sides
+        sides = _narrowed(sides)
     elif rng.uniform() < 0.25:  # a shelf
         wide, deep, high = rng.uniform(0.25, 0.6), rng.uniform(0.08, 0.14), rng.uniform(0.15, 0.4)
         wide, y = min(wide, a - 0.05), back - deep - 0.01
         blocks += [StaticBox((0, y, high), (wide, deep, 0.01)),
                    *(StaticBox((s * wide, y, high / 2), (0.01, deep, high / 2)) for s in (-1, 1))]  # fmt: skip
         areas.append((-wide + 0.05, wide - 0.05, y - deep + 0.04, y + deep - 0.04, high + 0.01))
-        sides = (1.1 * math.pi, 1.9 * math.pi) if sides[0] == 0 else sides
-    for _ in range(rng.integers(1, 5) if rng.uniform() < MAT_SHARE else 0):
-        blocks.append(_mat(used, rng))
-    return Furniture(blocks, areas, sides)
+        sides = _narrowed(sides)
+    return Furniture(blocks, areas, sides, back=back)
+
+
+def _seat(rng: Rng) -> Furniture:
+    """A chair, bench or sofa with a back that may be curved, tilted or of slats, and in some scenes with arms."""
+    a, b = math.exp(rng.uniform(math.log(0.22), math.log(0.8))), rng.uniform(0.2, 0.4)
+    thick, height = rng.uniform(0.01, 0.08), rng.uniform(0.3, 0.6)
+    alike = 0 if rng.uniform() < 0.7 else None
+    blocks = [StaticBox((0, 0, -thick), (a, b, thick), paint=0), _floor(height)]
+    if rng.uniform() < 0.5:
+        blocks += _legs(0.9 * a, 0.85 * b, 2 * thick, height)
+    else:  # down to the floor
+        half = (height - 2 * thick) / 2
+        blocks.append(StaticBox((0, 0, half - height), (0.95 * a, 0.95 * b, half), 2 * SPACING, paint=alike))
+    if rng.uniform() < 0.85:
+        blocks += _back(a, b, alike, rng)
+    if rng.uniform() < 0.4:
+        wide, high = rng.uniform(0.015, 0.08), rng.uniform(0.06, 0.12)
+        blocks += [StaticBox((s * (a + wide), 0, high - thick), (wide, b, high + thick), paint=alike) for s in (-1, 1)]
+    return Furniture(blocks, [(-0.9 * a, 0.9 * a, -0.85 * b, 0.75 * b, 0.0)], FRONT, back=b + 0.3)
+
+
+def _back(a: float, b: float, paint: int | None, rng: Rng) -> list[StaticBox]:
+    """The back of a seat of half sides a and b: strips along an arc, tilted backwards."""
+    strips = int(rng.integers(5, 12)) if rng.uniform() < 0.6 else 1
+    bend = min(rng.uniform(0.1, 0.7), 2 * math.atan(0.25 * b / a)) if strips > 1 else 0.0  # a quarter of b deep
+    rise, deep, tilt = rng.uniform(0.12, 0.35), rng.uniform(0.008, 0.06), rng.uniform(0, 0.35)
+    gap = rng.uniform(0, 0.12) if rng.uniform() < 0.3 else -0.02  # between it and the seat
+    if slats := strips > 1 and rng.uniform() < 0.3:
+        bend *= 0.5
+    radius = a / math.sin(bend) if bend else 0.0
+    wide = a if strips == 1 else (0.55 if slats else 1.04) * max(a, radius * bend) / strips
+    out = []
+    for k in range(strips):
+        angle = bend * (2 * (k + 0.5) / strips - 1) if strips > 1 else 0.0
+        x, y = radius * math.sin(angle), b + deep - radius * (1 - math.cos(angle))
+        up = math.sin(tilt) * rise  # the middle is this far behind the lower edge
+        centre = (x - up * math.sin(-angle), y + up * math.cos(angle), gap + math.cos(tilt) * rise)
+        out.append(StaticBox(centre, (wide, deep, rise), yaw=angle, tilt=-tilt, paint=paint))
+    return out
+
+
+def _legs(x: float, y: float, top: float, height: float) -> list[StaticBox]:
+    """Four legs from `top` below z = 0 to the floor at -height."""
+    half = (0.03, 0.03, (height - top) / 2)
+    return [StaticBox((sx * x, sy * y, half[2] - height), half, COARSE) for sx in (-1, 1) for sy in (-1, 1)]
+
+
+def _floor(height: float) -> StaticBox:
+    return StaticBox((0, 0, -height - 0.05), (4, 4, 0.05), COARSE)
+
+
+def _nearby(back: float, rng: Rng) -> list[StaticBox]:
+    """Cabinets, boards and boxes that stand on the floor behind."""
+    out = []
+    for _ in range(int(rng.integers(1, 4))):
+        half = (rng.uniform(0.1, 0.5), rng.uniform(0.02, 0.3), rng.uniform(0.3, 0.7))
+        reach = math.hypot(*half[:2])
+        x, y = rng.uniform(-1.0, 1.0), back + reach + rng.uniform(0.02, 0.5)
+        out.append(StaticBox((x, y, half[2] - 0.6), half, 1.6 * SPACING, yaw=rng.uniform(0, math.pi)))
+    return out
 
 
 def _mat(used: tuple[float, float], rng: Rng) -> StaticBox:
@@ -100,12 +189,15 @@ def _mat(used: tuple[float, float], rng: Rng) -> StaticBox:
 def painted(furniture: Furniture, rng: Rng) -> Gaussians:
     """The Gaussians of all faces, object_id 0."""
     parts = []
+    faces: dict[int, Callable[[Tensor], Tensor]] = {}
     for block in furniture.blocks:
         surface = box(tuple(2 * h for h in block.half), block.spacing)
         keep = (surface.points.abs() + torch.tensor(block.centre).abs()).amax(1) < 6
-        surface = surface.kept(keep)
-        rgb = random_face(rng)(surface.points) * _daylight(surface.normals)[:, None]
-        parts.append(to_gaussians(surface.moved(block.centre), rgb, 0, width=0.7, widest=3 * block.spacing))
+        surface, R = surface.kept(keep), block.rotation()
+        placed = Surface(surface.points @ R.T, surface.normals @ R.T).moved(block.centre)
+        face = random_face(rng) if block.paint is None else faces.setdefault(block.paint, random_face(rng))
+        rgb = face(surface.points if block.paint is None else placed.points) * _daylight(placed.normals)[:, None]
+        parts.append(to_gaussians(placed, rgb, 0, width=0.7, widest=3 * block.spacing))
     for drape in furniture.drapes:
         surface = drape.surface(SPACING)
         rgb = (random_face if rng.uniform() < 0.5 else random_paint)(rng)(surface.points)

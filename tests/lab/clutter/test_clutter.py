@@ -232,3 +232,33 @@ def test_composites_are_one_normalised_object_of_several_parts(seed):
     assert len(prop.parts.unique()) >= 3
     again = make_composite(seed)
     assert torch.equal(again.gaussians.means, g.means) and torch.equal(again.parts, prop.parts)
+
+
+def test_a_turned_box_is_drawn_where_things_rest_on_it():
+    from stages.core.geometry.rotations import matrix
+    from stages.lab.clutter.settle import settle
+    from stages.lab.clutter.supports import Furniture, StaticBox, painted
+
+    block = StaticBox((0.1, -0.2, 0.3), (0.3, 0.2, 0.1), yaw=0.7, tilt=-0.3)
+    R = block.rotation()
+    assert torch.allclose(matrix(torch.tensor([block.quaternion()]))[0], R, atol=1e-6)
+    furniture = Furniture([block], [(-1, 1, -1, 1, 0)], (0, 6.28))
+    g = painted(furniture, np.random.default_rng(0))
+    local = (g.means - torch.tensor(block.centre)) @ R
+    assert torch.allclose(local.abs().amax(0), torch.tensor(block.half), atol=2e-3)
+    cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.02
+    above = torch.tensor(block.centre) + R @ torch.tensor([0, 0, block.half[2] + 0.025])
+    at, _ = settle(furniture, [[cube]], above[None].numpy())
+    height = float(((torch.from_numpy(at[0]).float() - torch.tensor(block.centre)) @ R)[2])
+    assert abs(height - block.half[2] - 0.02) < 2e-3  # friction holds it on a slope of .3 rad
+
+
+def test_seats_have_backs_behind_what_lies_on_them():
+    from stages.lab.clutter.supports import _seat
+
+    for seed in range(20):
+        seat = _seat(np.random.default_rng(seed))
+        _, _, _, y1, z = seat.areas[0]
+        high = [b for b in seat.blocks if b.centre[2] + b.half[2] > 0.2]
+        assert z == 0 and all(b.centre[1] > 0.99 * y1 or b.centre[1] == 0 for b in high)  # backs and arms
+        assert all(b.centre[1] + b.half[1] < seat.back for b in high)

@@ -20,7 +20,7 @@ from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.materials import Material
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, Trajectory
 from stages.lab.bench.common import write_results
-from stages.lab.bench.physics_experiments import Run, Specimen, ball, block, cube
+from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, cube
 from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, as_json, fitted

@@ -20,7 +20,9 @@ from stages.core.scene.files import replacing
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.lab.bench.common import machine, write_json
-from stages.lab.bench.physics_experiments import Experiment, Run, experiments
+from stages.lab.bench.experiments.bodies import Run
+from stages.lab.bench.experiments.catalogue import experiments
+from stages.lab.bench.experiments.experiment import Experiment
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.stage import run as simulate
 

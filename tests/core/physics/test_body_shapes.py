@@ -14,7 +14,7 @@ from stages.core.physics.particles import sample_bodies
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, ellipsoid, to_gaussians
-from stages.lab.bench.physics_experiments import tilted
+from stages.lab.bench.experiments.bodies import tilted
 
 SIDES = np.array([0.4, 0.3, 0.2])
 

@@ -14,7 +14,7 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
-from stages.lab.bench.physics_experiments import bowl
+from stages.lab.bench.experiments.bodies import bowl
 from tests.conftest import two_balls_scene
 
 

@@ -12,7 +12,7 @@ from stages.core.physics.particles import sample_bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
-from stages.lab.bench.physics_experiments import tilted
+from stages.lab.bench.experiments.bodies import tilted
 from tests.conftest import ball
 
 SIDES = torch.tensor([0.4, 0.3, 0.2])

@@ -8,8 +8,9 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.core.physics import solid_surface
+from stages.lab.bench.experiments.catalogue import experiments
+from stages.lab.bench.experiments.friction import leaning_angle
 from stages.lab.bench.physics import PhysicsBenchOptions, measure, run
-from stages.lab.bench.physics_experiments import experiments, leaning_angle
 from stages.simulate.options import QUALITIES, MpmQuality
 
 ALL = experiments()

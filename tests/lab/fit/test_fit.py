@@ -17,7 +17,7 @@ from stages.core.physics.materials import Material, choose_materials
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
-from stages.lab.bench.physics_experiments import Run, ball, block
+from stages.lab.bench.experiments.bodies import Run, ball, block
 from stages.lab.fit import search
 from stages.lab.fit.alignment import aligned
 from stages.lab.fit.fit import Fit, _command, run, solve, with_initial

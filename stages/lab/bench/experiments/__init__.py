@@ -1,0 +1,1 @@
+"""Textbook experiments for the engines of `ngff simulate`."""

@@ -1,0 +1,18 @@
+"""All experiments, in the order of the report."""
+
+from collections.abc import Mapping
+from functools import cache
+from types import MappingProxyType
+
+from stages.lab.bench.experiments.experiment import Experiment
+from stages.lab.bench.experiments.friction import compound_slides, creep, rocking, rolls, slides, slopes
+from stages.lab.bench.experiments.impacts import bounces, collisions, falls, invariance, rebounds, torques
+from stages.lab.bench.experiments.stacks import boxes, piles, stacks, towers
+
+
+@cache
+def experiments() -> Mapping[str, Experiment]:
+    """All experiments by name."""
+    groups = (slides, compound_slides, slopes, rolls, rocking, creep, falls, torques, towers, invariance,
+              collisions, rebounds, bounces, stacks, piles, boxes)  # fmt: skip
+    return MappingProxyType({e.name: e for group in groups for e in group()})

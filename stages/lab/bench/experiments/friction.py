@@ -1,0 +1,123 @@
+"""Experiments of bodies that slide, roll or lean on the floor, on a slope or on each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+
+from stages.core.scene.trajectory import Trajectory
+from stages.lab.assets.shapes import box, ellipsoid
+from stages.lab.bench.experiments.bodies import Run, Specimen, about_z, block, compound, on_slope, tilted
+from stages.lab.bench.experiments.experiment import SLIDES, TOLERANCES, Experiment, G
+from stages.lab.bench.experiments.measures import path
+
+
+def slides() -> Iterator[Experiment]:
+    """Boxes that slide on the floor until friction stops them."""
+    for mu in (0.0, 0.1, 0.3, 0.6, 1.0):
+        run = Run((block((0.3, 0.2, 0.08), (0, 0, 0.04)),), {"velocity": ("object=1 2,0,0",), "friction": mu})
+        time = 99 * 0.02
+        stop = 4 / (2 * mu * G) if mu else math.inf
+        value = min(stop, 2 * time - mu * G * time**2 / 2) if mu * G * time < 2 else stop
+        yield Experiment(f"slide/friction={mu:g}", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
+                         "distance from 2 m/s in 2 s [m]", value, SLIDES)  # fmt: skip
+
+    body = replace(block((0.3, 0.3, 0.15), (0, 0, 0.075)), loss=0.01)
+    run = Run((body,), {"velocity": ("object=1 .3,0,0",), "friction": 0.1})  # the speed of a fall of 5 mm
+    value = 0.09 / (2 * 0.1 * G)
+    yield Experiment("slide/slow friction=0.1", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
+                     "distance from .3 m/s [m]", value, SLIDES)  # fmt: skip
+
+    for mu in (0.1, 0.3, 0.6):  # a body that its weight compresses by 2.1 %
+        run = Run((block((0.3, 0.2, 0.08), (0, 0, 0.04), E=1e5, density=2700.0),),
+                  {"velocity": ("object=1 1,0,0",), "friction": mu, "steps": 76})  # fmt: skip
+        value = 1 / (2 * mu * G)
+        yield Experiment(f"slide/soft friction={mu:g}", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
+                         "distance from 1 m/s [m]", value, SLIDES)  # fmt: skip
+
+
+def compound_slides() -> Iterator[Experiment]:
+    """Bodies of several boxes that start at 1 m/s along x on others of several boxes, which do not move."""
+    stool = compound(0.008, ((0.3, 0.3, 0.04), (0, 0, 0.18)),
+                     *(((0.04, 0.04, 0.16), (x, y, 0.08)) for x, y in product((-0.13, 0.13), repeat=2)))  # fmt: skip
+    bridge = compound(0.01, ((0.3, 0.1, 0.04), (0, 0, 0.14)), ((0.04, 0.1, 0.12), (-0.13, 0, 0.06)),
+                      ((0.04, 0.1, 0.12), (0.13, 0, 0.06)))  # fmt: skip
+    tee = compound(0.01, ((0.24, 0.08, 0.05), (0, 0, 0.025)), ((0.06, 0.06, 0.14), (0, 0, 0.12)))
+    shelf = compound(0.012, ((1.0, 0.4, 0.03), (0, 0, -0.015)), ((0.03, 0.4, 0.3), (-0.485, 0, -0.18)),
+                     ((0.03, 0.4, 0.3), (0.485, 0, -0.18)))  # fmt: skip
+    rail = compound(0.01, ((1.2, 0.2, 0.03), (0, 0, -0.015)), ((0.04, 0.2, 0.1), (-0.58, 0, 0.02)))
+    pairs = {
+        "stool on shelf": (stool, shelf, 0),
+        "bridge on shelf": (bridge, shelf, 5),
+        "tee on rail": (tee, rail, 10),
+    }
+    for (name, (above, below, degrees)), mu in product(pairs.items(), (0.2, 0.6)):
+        bodies = below.moved((0, 0, 0.4)), about_z(above, degrees).moved((-0.3, 0, 0.4))
+        value = 1 / (2 * mu * G)
+        run = Run(tuple(map(Specimen, bodies)), {"pin": ("1",), "velocity": ("object=2 1,0,0",), "friction": mu,
+                                                 "steps": 10 + math.ceil(1 / (mu * G * 0.02))})  # fmt: skip
+        yield Experiment(f"slide/{name} friction={mu:g}", (run,), lambda t: float(path(t, 1)[-1, 0]), value,
+                         "distance from 1 m/s [m]", value, SLIDES)  # fmt: skip
+
+
+def slopes() -> Iterator[Experiment]:
+    """A box let go on a slope, which slides or stays."""
+    for degrees, mu in product((10, 25, 40), (0.0, 0.3, 0.8)):
+        a, time = math.radians(degrees), 30 * 0.02
+        pull = G * max(math.sin(a) - mu * math.cos(a), 0.0)
+        run = on_slope(degrees, 0.15, {"friction": mu, "steps": 31})
+        yield Experiment(f"slope/{degrees}deg friction={mu:g}", (run,), lambda t: float(path(t, 1)[-1].norm()),
+                         pull * time**2 / 2, "distance in .6 s [m]", G * math.sin(a) * time**2 / 2, SLIDES)  # fmt: skip
+
+
+def rolls() -> Iterator[Experiment]:
+    """A solid ball on a slope that grips: a = 5/7 g sin(slope), as its inertia is 2/5 m r^2."""
+    radius, time = 0.1, 30 * 0.02
+    for degrees in (10, 25):
+        distance = 5 / 7 * G * math.sin(math.radians(degrees)) * time**2 / 2
+        run = on_slope(
+            degrees, 0.15, {"friction": 0.8, "steps": 31}, ellipsoid((radius,) * 3, 1500).moved((0, 0, radius))
+        )
+        yield Experiment(f"roll/{degrees}deg", (run,), lambda t: float(path(t, 1)[-1].norm()), distance,
+                         "distance in .6 s [m]", distance, TOLERANCES)  # fmt: skip
+
+
+def rocking() -> Iterator[Experiment]:
+    """A block let go while it leans on a lower edge: it turns about the edge as a pendulum upside down."""
+    width, height, start, time = 0.2, 0.3, math.radians(12), 0.14
+    # the corners of a sampled box are half a spacing inside it, here 3 % of the lever arm of its weight
+    leaning = tilted(box((width, height, height), 0.004).moved((-width / 2, 0, height / 2)), math.degrees(start))
+    left = leaning_angle(width, height, start, time)
+    run = Run((Specimen(leaning),), {"friction": 1.0, "dt": 0.01, "steps": 15})
+
+    def angle(t: Trajectory) -> float:
+        return math.degrees(start + 2 * math.atan2(*t.rotation[-1, 0, [2, 0]].tolist()))
+
+    yield Experiment("rocking/12deg", (run,), angle, math.degrees(left), "angle after .14 s [degrees]",
+                     math.degrees(start - left), TOLERANCES)  # fmt: skip
+
+
+def leaning_angle(width: float, height: float, start: float, time: float) -> float:
+    """Angle [rad] of a rigid block that leans on an edge, `time` [s] after it was let go at the angle `start`.
+
+    Housner 1963, "The behavior of inverted pendulum structures during earthquakes", equation 2:
+    4/3 m R^2 angle'' = -m g R sin(slenderness - angle), with the half diagonal R; integrated by small leapfrog steps.
+    """
+    slenderness, half_diagonal = math.atan2(width, height), math.hypot(width, height) / 2
+    steps = 10_000
+    dt, angle, rate = time / steps, start, 0.0
+    for k in range(steps):
+        rate -= dt * (0.5 if k == 0 else 1) * 0.75 * G / half_diagonal * math.sin(slenderness - angle)
+        angle += dt * rate
+    return angle
+
+
+def creep() -> Iterator[Experiment]:
+    """A box that friction holds on a slope, for ten seconds."""
+    for loss in (0.02, 0.15):
+        run = on_slope(15, loss, {"friction": 0.3, "steps": 501})  # tan 15 degrees is .268
+        yield Experiment(f"creep/15deg friction=0.3 loss={loss:g}", (run,),
+                         lambda t: 1e4 * float((t.com[-1, 1] - t.com[25, 1]).norm()) / 0.2, 0.0,
+                         "distance from .5 to 10 s [1e-4 sides]", 1.0, dict.fromkeys(TOLERANCES, 1.0))  # fmt: skip

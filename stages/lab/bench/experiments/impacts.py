@@ -1,0 +1,103 @@
+"""Experiments of free motion, of its symmetries, and of impacts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from stages.core.scene.trajectory import Trajectory
+from stages.lab.bench.experiments.bodies import Run, ball, cube
+from stages.lab.bench.experiments.experiment import TOLERANCES, Experiment, G
+from stages.lab.bench.experiments.measures import largest_difference, largest_shift, path, rebound, spin
+
+
+def falls() -> Iterator[Experiment]:
+    """Free fall."""
+    for g in (1.62, 9.81, 25.0):
+        frames = round(math.sqrt(2 * 0.2 / g) / 0.02)
+        run = Run((cube(0.2, bottom=0.4),), {"gravity": g, "steps": frames + 1})
+        value = g * (0.02 * frames) ** 2 / 2
+        yield Experiment(f"fall/gravity={g:g}", (run,), lambda t: float(-path(t, 0)[-1, 2]), value, "fall [m]", value,
+                         TOLERANCES)  # fmt: skip
+
+
+def torques() -> Iterator[Experiment]:
+    """A torque and a push of .2 s on a box and a ball in free space."""
+    density, side, radius = 540.0, 0.3, 0.15
+    mass = {"box": density * side**3, "ball": density * 4 / 3 * math.pi * radius**3}
+    inertia = {"box": mass["box"] * side**2 / 6, "ball": 0.4 * mass["ball"] * radius**2}
+    bodies = {"box": cube(side, bottom=0.6), "ball": ball(radius, (0, 0, 0.75))}
+    for name, body in bodies.items():
+        options = {"gravity": 0.0, "force": (f"object=1 torque=0,0,{5 * inertia[name]:.6g} to=0.2",), "steps": 26}
+        yield Experiment(f"torque/{name}", (Run((body,), options),), spin, 1.0, "angular speed [rad/s]", 1.0,
+                         TOLERANCES)  # fmt: skip
+        options = {"gravity": 0.0, "force": (f"object=1 force={5 * mass[name]:.6g},0,0 to=0.2",), "steps": 26}
+        yield Experiment(f"push/{name}", (Run((body,), options),),
+                         lambda t: float(path(t, 0)[-1, 0] - path(t, 0)[-2, 0]) / t.info.dt, 1.0, "speed [m/s]", 1.0,
+                         TOLERANCES)  # fmt: skip
+
+
+def invariance() -> Iterator[Experiment]:
+    """The same motion in other units of length and of mass."""
+
+    def stack(s: float = 1.0, factor: float = 1.0) -> Run:
+        more = {"density": 540.0 * factor, "E": 1e7 * factor * s}  # E / (density g size) stays the same
+        return Run((cube(0.3 * s, **more), cube(0.18 * s, 0.02 * s, 0.33 * s, **more)),
+                   {"steps": 40, "dt": 0.02 * math.sqrt(s),
+                    "velocity": (f"object=2 {0.5 * math.sqrt(s)},0,0",)})  # fmt: skip
+
+    for s in (0.01, 0.1, 10.0, 100.0):
+        yield Experiment(f"scale/{s:g}", (stack(), stack(s)), lambda a, b, s=s: largest_difference(a, b, s, 0.18), 0.0,
+                         "difference of motion [sizes]", 1.0, TOLERANCES)  # fmt: skip
+    for factor in (0.1, 10.0):
+        yield Experiment(f"mass and E/{factor:g}", (stack(), stack(factor=factor)),
+                         lambda a, b: largest_difference(a, b, 1.0, 0.18), 0.0, "difference of motion [sizes]", 1.0,
+                         TOLERANCES)  # fmt: skip
+
+
+def collisions() -> Iterator[Experiment]:
+    """Two balls that collide in free space, and two boxes at rest beside each other."""
+    pair = Run((ball(0.15, (0, 0, 0.5)), ball(0.15, (0.6, 0, 0.5), density=1080.0)),
+               {"gravity": 0.0, "velocity": ("object=1 1,0,0",), "steps": 50})  # fmt: skip
+    mass = torch.tensor([1.0, 2.0])
+
+    def speeds(t: Trajectory) -> Tensor:
+        return (t.com[-1, :, 0] - t.com[-6, :, 0]) / (5 * t.info.dt)
+
+    yield Experiment("collision/momentum", (pair,), lambda t: float(mass @ speeds(t)), 1.0, "momentum, 1 before", 1.0,
+                     TOLERANCES)  # fmt: skip
+    e = math.exp(-math.pi * 0.15 / 2)
+    yield Experiment("collision/restitution", (pair,), lambda t: float(speeds(t) @ torch.tensor([-1.0, 1.0])), e,
+                     "speed of separation, 1 of approach", 1.0, TOLERANCES)  # fmt: skip
+    still = Run((cube(0.3, bottom=0.5), cube(0.3, 0.5, 0.5)), {"gravity": 0.0})
+    yield Experiment("free space/two at rest", (still,), lambda t: largest_shift(t) / 0.3, 0.0, "largest shift [sides]",
+                     1.0, TOLERANCES)  # fmt: skip
+
+
+def rebounds() -> Iterator[Experiment]:
+    """Balls and boxes that fall on the floor from half a metre."""
+    for (name, body), loss in product((("ball", ball(0.15, (0, 0, 0.15))), ("box", cube(0.3))), (0.05, 0.15, 0.4)):
+        run = Run((replace(body, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
+        yield Experiment(f"rebound/{name} loss={loss:g}", (run,), lambda t: rebound(t, 0.5),
+                         math.exp(-math.pi * loss / 2), "restitution", 1.0, TOLERANCES)  # fmt: skip
+
+    soft = replace(ball(0.15, (0, 0, 0.15)), E=2e5, density=600.0)  # the impact compresses it by a sixth
+    run = Run((soft,), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
+    yield Experiment("rebound/soft ball loss=0.15", (run,), lambda t: rebound(t, 0.5), math.exp(-math.pi * 0.15 / 2),
+                     "restitution", 1.0, TOLERANCES)  # fmt: skip
+
+
+def bounces() -> Iterator[Experiment]:
+    """A ball that falls .5 m while it flies sideways: friction takes mu (1 + e) of its normal speed, until it rolls."""
+    for loss, mu in product((0.02, 0.15), (0.1, 0.5)):
+        body = replace(ball(0.15, (0, 0, 0.15)), loss=loss)
+        run = Run((body,), {"lift": ("0.5",), "velocity": ("object=1 3,0,0",), "friction": mu, "dt": 0.01, "steps": 61})
+        lost = mu * (1 + math.exp(-math.pi * loss / 2)) * math.sqrt(2 * G * 0.5)
+        yield Experiment(f"bounce/friction={mu:g} loss={loss:g}", (run,),
+                         lambda t: float(path(t, 0)[-1, 0] - path(t, 0)[-11, 0]) / (10 * t.info.dt),
+                         max(3 - lost, 15 / 7), "horizontal speed, 3 before [m/s]", 3.0, TOLERANCES)  # fmt: skip

@@ -1,0 +1,55 @@
+"""Experiments of bodies that come to rest on each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import torch
+
+from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, bowl, cube
+from stages.lab.bench.experiments.experiment import GAPS, TOLERANCES, Experiment
+from stages.lab.bench.experiments.measures import gap, largest_shift, overlap
+
+
+def towers() -> Iterator[Experiment]:
+    """Upright towers of cubes, of which the topmost is let fall from 5 mm."""
+    for count, seconds in ((3, 2), (6, 2), (10, 2), (6, 20)):
+        cubes = tuple(cube(0.2, bottom=0.2 * i) for i in range(count))
+        run = Run(cubes, {"steps": 50 * seconds, "lift": (f"{count}=.005",)})
+        yield Experiment(f"tower/{count} for {seconds}s", (run,), lambda t: largest_shift(t) / 0.2, 0.0,
+                         "largest shift [sides]", 1.0, {"rigid": 0.05, "mpm": 0.1, "ngff": 0.1})  # fmt: skip
+
+
+def stacks() -> Iterator[Experiment]:
+    """Bodies of unequal stiffness or size on each other."""
+    soft = (cube(0.3, E=1e5, density=100.0), cube(0.15, bottom=0.31, E=1e9, density=2700.0))
+    small = (cube(0.5), cube(0.05, bottom=0.505))
+    rod = (cube(0.2, -0.3), cube(0.2, 0.3), block((1.0, 0.1, 0.1), (0, 0, 0.26)))
+    yield Experiment("stack/heavy on soft", (Run(soft),), gap, 0.0, "gap [heights]", 1.0, GAPS)
+    yield Experiment("stack/size 1:10", (Run(small),), gap, 0.0, "gap [heights]", 1.0, GAPS)
+    yield Experiment("stack/rod on two boxes", (Run(rod),), lambda t: gap(t, 3, 1), 0.0, "gap [heights]", 1.0, GAPS)
+
+
+def piles() -> Iterator[Experiment]:
+    """Many balls in a heap, and one in a bowl."""
+    inside = Run((Specimen(bowl(0.25, 0.3), E=1e7), ball(0.08, (0.0, 0.0, 0.14), loss=0.4)), {"steps": 150})
+    yield Experiment("pile/ball in a bowl", (inside,), lambda t: float(t.com[-1, 1, 2]) / 0.08, 0.13 / 0.08,
+                     "height of its middle [radii]", 1.0, TOLERANCES)  # fmt: skip
+    for count in (20, 40):
+        random = torch.Generator().manual_seed(count)
+        places = torch.cartesian_prod(torch.arange(2.0), torch.arange(2.0), torch.arange(count / 4))
+        jitter = 0.02 * torch.rand(places.shape, generator=random)
+        centres = (0.24 * places + jitter + torch.tensor([0.0, 0.0, 0.11])).tolist()
+        heap = Run(tuple(ball(0.1, tuple(c), loss=0.4) for c in centres), {"steps": 150})
+        yield Experiment(f"pile/heap of {count}", (heap,), lambda t: overlap(t, 0.1), 0.0,
+                         "largest overlap [diameters]", 1.0, {"rigid": 0.03, "mpm": 0.03, "ngff": 0.03})  # fmt: skip
+
+
+def boxes() -> Iterator[Experiment]:
+    """A box that falls on a larger one, of materials from foam to steel."""
+    for side, density, E in product((0.03, 0.06, 0.15, 0.3), (50.0, 540.0, 1000.0, 2700.0, 7850.0), (1e5, 1e7, 1e9)):
+        pair = (cube(5 / 3 * side, E=E, density=density), cube(side, bottom=5 / 3 * side, E=E, density=density))
+        dropped = Run(pair, {"steps": 50, "lift": (f"2={0.1 * side:g}",)})  # what is not lifted may sleep where it is
+        yield Experiment(f"boxes/{side:g}m {density:g}kg/m3 {E:.0e}Pa", (dropped,), gap, 0.0, "gap after 1 s [heights]",
+                         1.0, GAPS)  # fmt: skip

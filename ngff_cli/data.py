@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 from typer.models import OptionInfo
 
-from ngff_cli.options import AsJson, Device, Keypoints, SceneCount, Seed, print_results
+from ngff_cli.options import AsJson, Device, Keypoints, Out, SceneCount, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer()
@@ -116,7 +116,7 @@ def import_(
 @app.command()
 def statistics(
     data: Annotated[Path, Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
-    out: Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")] = None,
+    out: Out = None,
     groups: Groups = "3_0..3_9,4,6",
     keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 512,
     against: Annotated[
@@ -145,7 +145,7 @@ def statistics(
 
 @app.command()
 def study(
-    out: Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")] = None,
+    out: Out = None,
     scenes: SceneCount = 24,
     device: Device = "auto",
     as_json: AsJson = False,

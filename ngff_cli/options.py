@@ -27,6 +27,13 @@ Threads = Annotated[int | None, typer.Option(
          "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
 SceneCount = Annotated[int, typer.Option(help="number of scenes")]
 Keypoints = Annotated[int, typer.Option(help="keypoints per object")]
+Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
+OutKept = Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")]
+OutWithTable = Annotated[
+    Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
+]
+Quality = Annotated[str, typer.Option(help="quality of the reconstruction")]
+Compiled = Annotated[bool, typer.Option("--compiled", help="compile the training step first; for GPUs")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip

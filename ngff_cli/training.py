@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ngff_cli.options import Device, Keypoints, Seed
+from ngff_cli.options import Compiled, Device, Keypoints, Seed
 
 app = typer.Typer()
 
@@ -45,7 +45,7 @@ def train(
         str,
         Option(help="groups to train on, also varied, solid, turned, meshes; the last 100 scenes are for validation"),
     ] = "3_0..3_8",
-    compiled: Annotated[bool, Option("--compiled", help="compile the training step first; for GPUs")] = False,
+    compiled: Compiled = False,
     seed: Seed = 0,
     device: Device = "auto",
     start: Annotated[Path | None, Option("--from", help="initial weights (.safetensors); default: random")] = None,

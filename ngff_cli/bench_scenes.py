@@ -1,0 +1,180 @@
+"""Benchmarks of scenes: cameras, views, objects and what was filled in, against the truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from ngff_cli.options import AsJson, Device, Out, OutKept, OutWithTable, Quality, Seed, print_results
+from stages.core.errors import InputError
+
+app = typer.Typer()
+
+Holdout = Annotated[int, Option(help="hold out every N-th photo")]
+Views = Annotated[int, Option(help="number of cameras per scene")]
+
+
+@app.command("reconstruct")
+def bench_reconstruct(
+    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
+    out: OutKept = Path("reconstruct.json"),
+    quality: Quality = "normal",
+    holdout: Holdout = 8,
+    device: Device = "auto",
+    matcher: Annotated[str, Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
+    cameras: Annotated[
+        bool, Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
+    from stages.lab.bench.reconstruct import ReconstructBenchOptions, run
+
+    options = ReconstructBenchOptions(quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras)
+    print_results(lambda path: run(sets, path, options), out, as_json)
+
+
+@app.command("appearance")
+def bench_appearance(
+    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
+    out: OutKept = Path("appearance.json"),
+    quality: Quality = "high",
+    holdout: Holdout = 8,
+    models: Annotated[
+        Path | None, Option(help="folder in which cameras and sparse points are cached between runs")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Novel views: held-out photos rendered from our Gaussians and from gsplat's default recipe after equal time."""
+    from stages.lab.bench.appearance import AppearanceBenchOptions, run
+
+    options = AppearanceBenchOptions(quality=quality, holdout=holdout, models=models)
+    print_results(lambda path: run(sets, path, options), out, as_json)
+
+
+@app.command("segment")
+def bench_segment(
+    sets: Annotated[
+        list[Path] | None,
+        Argument(metavar="PHOTOSET...", show_default=False, help="with --photos: folders of photos, or with images/"),
+    ] = None,
+    photos: Annotated[
+        bool, Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
+    ] = False,
+    labels: Annotated[
+        Path | None,
+        Option(
+            help="with --photos: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
+        ),
+    ] = None,
+    labelled: Annotated[
+        Path | None,
+        Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"),
+    ] = None,
+    scenes: Annotated[int, Option(help="scenes of each kind: separate objects, and objects in contact")] = 4,
+    views: Views = 24,
+    weights: Annotated[
+        Path | None, Option(help="weights of network backends; default: searched; without any, they are skipped")
+    ] = None,
+    reconstruct: Annotated[
+        bool,
+        Option("--reconstruct", help="also segment scenes reconstructed from photos, by geometry and by the network"),
+    ] = False,
+    out: Out = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
+
+    With --photos: objects in real photos against label images: recall, IoU and panoptic quality.
+    """
+    if not photos:
+        if sets or labels or labelled:
+            raise InputError("PHOTOSET, --labels and --labelled: only apply to real photos; add --photos")
+        from stages.lab.bench.segment import SegmentBenchOptions, run
+
+        options = SegmentBenchOptions(
+            scenes=scenes, views=views, weights=weights, device=device, reconstruct=reconstruct
+        )
+        print_results(lambda path: run(path, options), out, as_json)
+        return
+    from stages.lab.bench.segment_photos import SegmentPhotosOptions
+    from stages.lab.bench.segment_photos import run as run_photos
+
+    chosen = SegmentPhotosOptions(labels=labels, labelled=labelled, device=device)
+    print_results(lambda path: run_photos(sets or [], path, chosen), out, as_json)
+
+
+@app.command("segment-ablation")
+def bench_segment_ablation(
+    train: Annotated[
+        list[Path],
+        Argument(metavar="FOLDER...", help="scenes to train on, of `clutter --reconstruct --exact`"),
+    ],
+    scores: Annotated[list[Path], Option(help="other scenes, for the scores of candidates; repeatable")],
+    judge: Annotated[list[Path], Option(help="reconstructed scenes to judge on; repeatable")],
+    out: OutWithTable = Path("segment_ablation.json"),
+    only: Annotated[list[str], Option(help="name of an ablation, such as colour; repeatable; default: all")] = [],  # noqa: B006
+    steps: Annotated[int, Option(help="training steps of each network")] = 1500,
+    batch: Annotated[int, Option(help="crops per step")] = 4,
+    workers: Annotated[int, Option(help="processes that prepare crops; 0: the training process itself")] = 0,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Ablation: retrain the segmentation network without one of its inputs, classes or kinds of data at a time."""
+    from stages.lab.bench.segment_ablation import SegmentAblationData, SegmentAblationOptions, run
+
+    options = SegmentAblationOptions(steps=steps, batch=batch, workers=workers, seed=seed, device=device)
+    data = SegmentAblationData(train, scores, judge)
+    print_results(lambda path: run(data, path, options, only), out, as_json)
+
+
+@app.command("refine")
+def bench_refine(
+    scenes: Annotated[int, Option(help="number of scenes of separate objects")] = 4,
+    views: Views = 24,
+    out: Out = None,
+    as_json: AsJson = False,
+) -> None:
+    """Inpainting of the table under removed objects: error against the true table in novel views."""
+    from stages.lab.bench.refine import RefineBenchOptions, run
+
+    options = RefineBenchOptions(scenes=scenes, views=views)
+    print_results(lambda path: run(path, options), out, as_json)
+
+
+@app.command("register")
+def bench_register(
+    only: Annotated[str, Option(help="names of the objects, such as ball,duck; default: all ten")] = "",
+    trials: Annotated[int, Option(help="partial views of each object")] = 10,
+    out: Out = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Registration of partial to complete objects, compared with ICP and splatreg."""
+    from stages.lab.bench.register import RegisterBenchOptions, run
+
+    options = RegisterBenchOptions(only=only, trials=trials, seed=seed, device=device)
+    print_results(lambda path: run(path, options), out, as_json)
+
+
+@app.command("complete")
+def bench_complete(
+    scene: Annotated[list[str], Option(help="names of the objects of a scene, separated by commas; repeatable")] = [  # noqa: B006
+        "panda,duck",
+        "can,miku",
+        "bowl,phone",
+    ],
+    known: Annotated[str, Option(help="names of the objects in the library; default: all ten")] = "",
+    out: Out = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Object completion: surface error, PSNR from behind, and error of simulated falls, by completer."""
+    from stages.lab.bench.complete import CompleteBenchOptions, run
+
+    options = CompleteBenchOptions(scenes=tuple(scene), known=known, seed=seed)
+    print_results(lambda path: run(path, options), out, as_json)

@@ -9,6 +9,14 @@ from typer import Option
 
 from ngff_cli.options import AsJson, Compiled, Device, Keypoints, Out, OutWithTable, SceneCount, Seed, print_results
 from stages.core.errors import InputError
+from stages.lab.bench.motion_options import (
+    AblationBenchOptions,
+    DynamicsBenchOptions,
+    FilmBenchOptions,
+    FitBenchOptions,
+    PhysicsBenchOptions,
+    TrackBenchOptions,
+)
 
 app = typer.Typer()
 
@@ -20,22 +28,25 @@ def bench_physics(
     out: OutWithTable = Path("physics.json"),
     only: Annotated[
         list[str], Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
-    ] = [],  # noqa: B006
-    engine: Annotated[list[str], Option(help="auto | rigid | mpm | ngff; repeatable; default: the last three")] = [],  # noqa: B006
-    quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = "draft",
-    keypoints: Keypoints = 256,
-    weights: Annotated[Path | None, Option(help="weights of the learned engine; default: those in the package")] = None,
-    contact: Annotated[str, Option(help="contacts of the engine ngff: auto | learned | solved")] = "auto",
-    device: Device = "auto",
+    ] = PhysicsBenchOptions.only,
+    engine: Annotated[list[str], Option(help="auto | rigid | mpm | ngff; repeatable")] = PhysicsBenchOptions.engines,
+    quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = PhysicsBenchOptions.quality,
+    keypoints: Keypoints = PhysicsBenchOptions.keypoints,
+    weights: Annotated[
+        Path | None, Option(help="weights of the learned engine; default: those in the package")
+    ] = PhysicsBenchOptions.weights,
+    contact: Annotated[
+        str, Option(help="contacts of the engine ngff: auto | learned | solved")
+    ] = PhysicsBenchOptions.contact,
+    device: Device = PhysicsBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Textbook experiments (slides, slopes, towers, rebounds, ...): each engine compared with the analytic value."""
-    from stages.lab.bench.physics import PhysicsBenchOptions, run
+    from stages.lab.bench.physics import run
 
-    chosen = {"engines": tuple(engine)} if engine else {}
     options = PhysicsBenchOptions(
-        only=tuple(only), quality=quality, keypoints=keypoints, weights=weights, contact=contact, device=device,
-        **chosen,
+        only=tuple(only), engines=tuple(engine), quality=quality, keypoints=keypoints, weights=weights,
+        contact=contact, device=device,
     )  # fmt: skip
     print_results(lambda path: run(path, options), out, as_json)
 
@@ -55,17 +66,17 @@ def bench_dynamics(
     results: Annotated[
         Path | None, Option("--from", help="only draw the table and plots of these results (.json)")
     ] = None,
-    keypoints: Keypoints = 256,
-    limit: Annotated[int, Option(help="scenes of each split; 0: all")] = 0,
+    keypoints: Keypoints = DynamicsBenchOptions.keypoints,
+    limit: Annotated[int, Option(help="scenes of each split; 0: all")] = DynamicsBenchOptions.limit,
     mpm: Annotated[
         int, Option(help="scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
-    ] = 100,
-    device: Device = "auto",
+    ] = DynamicsBenchOptions.mpm,
+    device: Device = DynamicsBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Dynamics models: errors of predicted motion on scenes not used in training."""
     from stages.core.models.checkpoints import SHIPPED
-    from stages.lab.bench.dynamics import DynamicsBenchOptions, redraw, run
+    from stages.lab.bench.dynamics import redraw, run
 
     if results is None and data is None:
         raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
@@ -82,19 +93,21 @@ def bench_ablation(
     data: Annotated[Path, Option(help="folder of motions, as `ngff-lab dataset` writes")],
     out: OutWithTable = Path("ablation.json"),
     only: Annotated[str, Option(help="names of the ablations, such as full,reaction; default: all")] = "",
-    steps: Annotated[int, Option(help="training steps of each ablation")] = 1500,
-    batch: Annotated[int, Option(help="scenes per training step")] = 64,
-    keypoints: Keypoints = 256,
-    horizons: Annotated[str, Option(help="rollout length of each training phase [frames]")] = "8,20",
-    groups: Annotated[str, Option(help="groups of scenes to train on")] = "3_0..3_8",
-    test: Annotated[str, Option(help="group of scenes to test on")] = "3_9",
-    compiled: Compiled = False,
-    seed: Seed = 0,
-    device: Device = "auto",
+    steps: Annotated[int, Option(help="training steps of each ablation")] = AblationBenchOptions.steps,
+    batch: Annotated[int, Option(help="scenes per training step")] = AblationBenchOptions.batch,
+    keypoints: Keypoints = AblationBenchOptions.keypoints,
+    horizons: Annotated[
+        str, Option(help="rollout length of each training phase [frames]")
+    ] = AblationBenchOptions.horizons,
+    groups: Annotated[str, Option(help="groups of scenes to train on")] = AblationBenchOptions.groups,
+    test: Annotated[str, Option(help="group of scenes to test on")] = AblationBenchOptions.test,
+    compiled: Compiled = AblationBenchOptions.compiled,
+    seed: Seed = AblationBenchOptions.seed,
+    device: Device = AblationBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Ablation: retrain the force field with one component removed at a time."""
-    from stages.lab.bench.ablation import AblationBenchOptions, run
+    from stages.lab.bench.ablation import run
 
     options = AblationBenchOptions(
         steps=steps, batch=batch, keypoints=keypoints, horizons=horizons, groups=groups, test=test, compiled=compiled,
@@ -105,20 +118,20 @@ def bench_ablation(
 
 @app.command("track")
 def bench_track(
-    sequences: Annotated[int, Option(help="number of sequences")] = 5,
-    first: Annotated[int, Option(help="seed of the first sequence")] = 0,
-    width: Annotated[int, Option(help="width of the videos [px]")] = 240,
-    frames: Annotated[int, Option(help="frames of motion")] = 50,
+    sequences: Annotated[int, Option(help="number of sequences")] = TrackBenchOptions.sequences,
+    first: Annotated[int, Option(help="seed of the first sequence")] = TrackBenchOptions.first,
+    width: Annotated[int, Option(help="width of the videos [px]")] = TrackBenchOptions.width,
+    frames: Annotated[int, Option(help="frames of motion")] = TrackBenchOptions.frames,
     reconstructed: Annotated[
         str,
         Option(help="track scenes reconstructed from the videos at this quality and segmented; default: true scenes"),
-    ] = "",
-    device: Device = "auto",
+    ] = TrackBenchOptions.quality,
+    device: Device = TrackBenchOptions.device,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """Tracking: errors of pose and time, and lost frames, in rendered videos of ten cameras with known motion."""
-    from stages.lab.bench.track import TrackBenchOptions, run
+    from stages.lab.bench.track import run
 
     options = TrackBenchOptions(
         sequences=sequences, first=first, width=width, frames=frames, quality=reconstructed, device=device
@@ -128,20 +141,22 @@ def bench_track(
 
 @app.command("fit")
 def bench_fit(
-    scenes: SceneCount = 20,
-    only: Annotated[str, Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
-    truth: Annotated[str, Option(help="engine of the motions; default: that which fits them")] = "",
-    noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
-    evaluations: Annotated[int, Option(help="largest number of simulations of a scene")] = 1500,
-    minutes: Annotated[float, Option(help="longest time of a scene [min]")] = 10.0,
-    workers: Workers = 2,
+    scenes: SceneCount = FitBenchOptions.scenes,
+    only: Annotated[
+        str, Option(help="slide | bounce | collision | soft; default: all four, alternating")
+    ] = FitBenchOptions.only,
+    truth: Annotated[str, Option(help="engine of the motions; default: that which fits them")] = FitBenchOptions.truth,
+    noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = FitBenchOptions.noise,
+    evaluations: Annotated[int, Option(help="largest number of simulations of a scene")] = FitBenchOptions.evaluations,
+    minutes: Annotated[float, Option(help="longest time of a scene [min]")] = FitBenchOptions.minutes,
+    workers: Workers = FitBenchOptions.workers,
     out: Out = None,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: Seed = FitBenchOptions.seed,
+    device: Device = FitBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Material estimation from motion: errors of the parameters and of the prediction of another motion."""
-    from stages.lab.bench.fit import FitBenchOptions, run
+    from stages.lab.bench.fit import run
 
     options = FitBenchOptions(
         scenes=scenes, only=only, truth=truth, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers,
@@ -152,19 +167,19 @@ def bench_fit(
 
 @app.command("fit-films")
 def bench_fit_films(
-    scenes: SceneCount = 6,
-    only: Annotated[str, Option(help="slide | throw; default: both, alternating")] = "",
-    cameras: Annotated[int, Option(help="films per scene")] = 2,
-    width: Annotated[int, Option(help="width of the films [px]")] = 320,
-    frames: Annotated[int, Option(help="frames of each film")] = 25,
-    workers: Workers = 2,
+    scenes: SceneCount = FilmBenchOptions.scenes,
+    only: Annotated[str, Option(help="slide | throw; default: both, alternating")] = FilmBenchOptions.only,
+    cameras: Annotated[int, Option(help="films per scene")] = FilmBenchOptions.cameras,
+    width: Annotated[int, Option(help="width of the films [px]")] = FilmBenchOptions.width,
+    frames: Annotated[int, Option(help="frames of each film")] = FilmBenchOptions.frames,
+    workers: Workers = FilmBenchOptions.workers,
     out: Out = None,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: Seed = FilmBenchOptions.seed,
+    device: Device = FilmBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Material estimation from films: errors of the parameters, beside those from the motion as it was tracked."""
-    from stages.lab.bench.fit_films import FilmBenchOptions, run
+    from stages.lab.bench.fit_films import run
 
     options = FilmBenchOptions(
         scenes=scenes, only=only, cameras=cameras, width=width, frames=frames, workers=workers, seed=seed, device=device

@@ -8,6 +8,17 @@ from typer import Argument, Option
 
 from ngff_cli.options import AsJson, Device, Out, OutKept, OutWithTable, Quality, Seed, print_results
 from stages.core.errors import InputError
+from stages.lab.bench.scene_options import (
+    AppearanceBenchOptions,
+    CompleteBenchOptions,
+    ReconstructBenchOptions,
+    RefineBenchOptions,
+    RegisterBenchOptions,
+    SegmentAblationData,
+    SegmentAblationOptions,
+    SegmentBenchOptions,
+    SegmentPhotosOptions,
+)
 
 app = typer.Typer()
 
@@ -19,17 +30,19 @@ Views = Annotated[int, Option(help="number of cameras per scene")]
 def bench_reconstruct(
     sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
     out: OutKept = Path("reconstruct.json"),
-    quality: Quality = "normal",
-    holdout: Holdout = 8,
-    device: Device = "auto",
-    matcher: Annotated[str, Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
+    quality: Quality = ReconstructBenchOptions.quality,
+    holdout: Holdout = ReconstructBenchOptions.holdout,
+    device: Device = ReconstructBenchOptions.device,
+    matcher: Annotated[
+        str, Option(help="features matched between photos: sift | aliked-lightglue")
+    ] = ReconstructBenchOptions.matcher,
     cameras: Annotated[
         bool, Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
-    ] = False,
+    ] = ReconstructBenchOptions.cameras,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
-    from stages.lab.bench.reconstruct import ReconstructBenchOptions, run
+    from stages.lab.bench.reconstruct import run
 
     options = ReconstructBenchOptions(quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras)
     print_results(lambda path: run(sets, path, options), out, as_json)
@@ -39,15 +52,15 @@ def bench_reconstruct(
 def bench_appearance(
     sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
     out: OutKept = Path("appearance.json"),
-    quality: Quality = "high",
-    holdout: Holdout = 8,
+    quality: Quality = AppearanceBenchOptions.quality,
+    holdout: Holdout = AppearanceBenchOptions.holdout,
     models: Annotated[
         Path | None, Option(help="folder in which cameras and sparse points are cached between runs")
-    ] = None,
+    ] = AppearanceBenchOptions.models,
     as_json: AsJson = False,
 ) -> None:
     """Novel views: held-out photos rendered from our Gaussians and from gsplat's default recipe after equal time."""
-    from stages.lab.bench.appearance import AppearanceBenchOptions, run
+    from stages.lab.bench.appearance import run
 
     options = AppearanceBenchOptions(quality=quality, holdout=holdout, models=models)
     print_results(lambda path: run(sets, path, options), out, as_json)
@@ -67,22 +80,24 @@ def bench_segment(
         Option(
             help="with --photos: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
         ),
-    ] = None,
+    ] = SegmentPhotosOptions.labels,
     labelled: Annotated[
         Path | None,
         Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"),
-    ] = None,
-    scenes: Annotated[int, Option(help="scenes of each kind: separate objects, and objects in contact")] = 4,
-    views: Views = 24,
+    ] = SegmentPhotosOptions.labelled,
+    scenes: Annotated[
+        int, Option(help="scenes of each kind: separate objects, and objects in contact")
+    ] = SegmentBenchOptions.scenes,
+    views: Views = SegmentBenchOptions.views,
     weights: Annotated[
         Path | None, Option(help="weights of network backends; default: searched; without any, they are skipped")
-    ] = None,
+    ] = SegmentBenchOptions.weights,
     reconstruct: Annotated[
         bool,
         Option("--reconstruct", help="also segment scenes reconstructed from photos, by geometry and by the network"),
-    ] = False,
+    ] = SegmentBenchOptions.reconstruct,
     out: Out = None,
-    device: Device = "auto",
+    device: Device = SegmentPhotosOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
@@ -92,14 +107,13 @@ def bench_segment(
     if not photos:
         if sets or labels or labelled:
             raise InputError("PHOTOSET, --labels and --labelled: only apply to real photos; add --photos")
-        from stages.lab.bench.segment import SegmentBenchOptions, run
+        from stages.lab.bench.segment import run
 
         options = SegmentBenchOptions(
             scenes=scenes, views=views, weights=weights, device=device, reconstruct=reconstruct
         )
         print_results(lambda path: run(path, options), out, as_json)
         return
-    from stages.lab.bench.segment_photos import SegmentPhotosOptions
     from stages.lab.bench.segment_photos import run as run_photos
 
     chosen = SegmentPhotosOptions(labels=labels, labelled=labelled, device=device)
@@ -116,15 +130,17 @@ def bench_segment_ablation(
     judge: Annotated[list[Path], Option(help="reconstructed scenes to judge on; repeatable")],
     out: OutWithTable = Path("segment_ablation.json"),
     only: Annotated[list[str], Option(help="name of an ablation, such as colour; repeatable; default: all")] = [],  # noqa: B006
-    steps: Annotated[int, Option(help="training steps of each network")] = 1500,
-    batch: Annotated[int, Option(help="crops per step")] = 4,
-    workers: Annotated[int, Option(help="processes that prepare crops; 0: the training process itself")] = 0,
-    seed: Seed = 0,
-    device: Device = "auto",
+    steps: Annotated[int, Option(help="training steps of each network")] = SegmentAblationOptions.steps,
+    batch: Annotated[int, Option(help="crops per step")] = SegmentAblationOptions.batch,
+    workers: Annotated[
+        int, Option(help="processes that prepare crops; 0: the training process itself")
+    ] = SegmentAblationOptions.workers,
+    seed: Seed = SegmentAblationOptions.seed,
+    device: Device = SegmentAblationOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Ablation: retrain the segmentation network without one of its inputs, classes or kinds of data at a time."""
-    from stages.lab.bench.segment_ablation import SegmentAblationData, SegmentAblationOptions, run
+    from stages.lab.bench.segment_ablation import run
 
     options = SegmentAblationOptions(steps=steps, batch=batch, workers=workers, seed=seed, device=device)
     data = SegmentAblationData(train, scores, judge)
@@ -133,13 +149,13 @@ def bench_segment_ablation(
 
 @app.command("refine")
 def bench_refine(
-    scenes: Annotated[int, Option(help="number of scenes of separate objects")] = 4,
-    views: Views = 24,
+    scenes: Annotated[int, Option(help="number of scenes of separate objects")] = RefineBenchOptions.scenes,
+    views: Views = RefineBenchOptions.views,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """Inpainting of the table under removed objects: error against the true table in novel views."""
-    from stages.lab.bench.refine import RefineBenchOptions, run
+    from stages.lab.bench.refine import run
 
     options = RefineBenchOptions(scenes=scenes, views=views)
     print_results(lambda path: run(path, options), out, as_json)
@@ -147,15 +163,17 @@ def bench_refine(
 
 @app.command("register")
 def bench_register(
-    only: Annotated[str, Option(help="names of the objects, such as ball,duck; default: all ten")] = "",
-    trials: Annotated[int, Option(help="partial views of each object")] = 10,
+    only: Annotated[
+        str, Option(help="names of the objects, such as ball,duck; default: all ten")
+    ] = RegisterBenchOptions.only,
+    trials: Annotated[int, Option(help="partial views of each object")] = RegisterBenchOptions.trials,
     out: Out = None,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: Seed = RegisterBenchOptions.seed,
+    device: Device = RegisterBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Registration of partial to complete objects, compared with ICP and splatreg."""
-    from stages.lab.bench.register import RegisterBenchOptions, run
+    from stages.lab.bench.register import run
 
     options = RegisterBenchOptions(only=only, trials=trials, seed=seed, device=device)
     print_results(lambda path: run(path, options), out, as_json)
@@ -163,18 +181,18 @@ def bench_register(
 
 @app.command("complete")
 def bench_complete(
-    scene: Annotated[list[str], Option(help="names of the objects of a scene, separated by commas; repeatable")] = [  # noqa: B006
-        "panda,duck",
-        "can,miku",
-        "bowl,phone",
-    ],
-    known: Annotated[str, Option(help="names of the objects in the library; default: all ten")] = "",
+    scene: Annotated[
+        list[str], Option(help="names of the objects of a scene, separated by commas; repeatable")
+    ] = CompleteBenchOptions.scenes,
+    known: Annotated[
+        str, Option(help="names of the objects in the library; default: all ten")
+    ] = CompleteBenchOptions.known,
     out: Out = None,
-    seed: Seed = 0,
+    seed: Seed = CompleteBenchOptions.seed,
     as_json: AsJson = False,
 ) -> None:
     """Object completion: surface error, PSNR from behind, and error of simulated falls, by completer."""
-    from stages.lab.bench.complete import CompleteBenchOptions, run
+    from stages.lab.bench.complete import run
 
     options = CompleteBenchOptions(scenes=tuple(scene), known=known, seed=seed)
     print_results(lambda path: run(path, options), out, as_json)

@@ -8,21 +8,29 @@ from typer import Argument, Option
 
 from ngff_cli.options import AsJson, Device, Out, Quality, print_results
 from stages.core.errors import InputError
+from stages.lab.bench.speed_options import (
+    ChainBenchOptions,
+    ChainTableOptions,
+    MpmBenchOptions,
+    Pi3BenchOptions,
+    RasterBenchOptions,
+    RolloutBenchOptions,
+)
 
 app = typer.Typer()
 
 
 @app.command("mpm")
 def bench_mpm(
-    device: Device = "auto",
-    particles: Annotated[list[int], Option(help="particles per scene; repeatable")] = [6_144, 20_000, 250_000],  # noqa: B006
-    scenes: Annotated[int, Option(help="scenes per batch; 0: chosen for the device")] = 0,
-    frames: Annotated[int, Option(help="frames of 200 substeps to time")] = 10,
+    device: Device = MpmBenchOptions.device,
+    particles: Annotated[list[int], Option(help="particles per scene; repeatable")] = MpmBenchOptions.particles,
+    scenes: Annotated[int, Option(help="scenes per batch; 0: chosen for the device")] = MpmBenchOptions.scenes,
+    frames: Annotated[int, Option(help="frames of 200 substeps to time")] = MpmBenchOptions.frames,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """MPM solver: time per substep and scenes per minute, compared with the unfused three-kernel solver."""
-    from stages.lab.bench.mpm import MpmBenchOptions, run
+    from stages.lab.bench.mpm import run
 
     options = MpmBenchOptions(device=device, particles=tuple(particles), scenes=scenes, frames=frames)
     print_results(lambda path: run(options, path), out, as_json)
@@ -32,15 +40,17 @@ def bench_mpm(
 def bench_raster(
     device: Annotated[str, Option(help="cpu, or cuda to compare with gsplat on a GPU")] = "cpu",
     out: Out = None,
-    repeat: Annotated[int, Option(help="timed calls of each; the fastest counts")] = 15,
-    shrink: Annotated[int, Option(help="factor by which the numbers of Gaussians and pixels are reduced")] = 1,
+    repeat: Annotated[int, Option(help="timed calls of each; the fastest counts")] = RasterBenchOptions.repeat,
+    shrink: Annotated[
+        int, Option(help="factor by which the numbers of Gaussians and pixels are reduced")
+    ] = RasterBenchOptions.shrink,
     as_json: AsJson = False,
 ) -> None:
     """Rasteriser: on the CPU compared with a per-pixel rasteriser, on a GPU (--device cuda) with gsplat."""
     from stages.core.backends import pick_device
     from stages.lab.bench import raster
 
-    options = raster.RasterBenchOptions(repeat=repeat, shrink=shrink)
+    options = RasterBenchOptions(repeat=repeat, shrink=shrink)
     if (at := pick_device(device)) == "cpu":
         print_results(lambda path: raster.run(path, options), out, as_json)
         return
@@ -51,16 +61,16 @@ def bench_raster(
 
 @app.command("pi3")
 def bench_pi3(
-    device: Device = "auto",
-    views: Annotated[list[int], Option(help="photos per pass; repeatable")] = [1, 8, 20, 50],  # noqa: B006
-    size: Annotated[int, Option(help="side of the photos, a multiple of 14 [px]")] = 448,
-    repeat: Annotated[int, Option(help="timed passes of each")] = 3,
-    splats: Annotated[bool, Option("--splats", help="include the Gaussian head")] = False,
+    device: Device = Pi3BenchOptions.device,
+    views: Annotated[list[int], Option(help="photos per pass; repeatable")] = Pi3BenchOptions.views,
+    size: Annotated[int, Option(help="side of the photos, a multiple of 14 [px]")] = Pi3BenchOptions.size,
+    repeat: Annotated[int, Option(help="timed passes of each")] = Pi3BenchOptions.repeat,
+    splats: Annotated[bool, Option("--splats", help="include the Gaussian head")] = Pi3BenchOptions.splats,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """π³ at its published size with random weights: time and memory, compared with unfused attention."""
-    from stages.lab.bench.pi3 import Pi3BenchOptions, run
+    from stages.lab.bench.pi3 import run
 
     options = Pi3BenchOptions(device=device, views=tuple(views), size=size, repeat=repeat, splats=splats)
     print_results(lambda path: run(options, out=path), out, as_json)
@@ -71,16 +81,18 @@ def bench_rollout(
     out: Annotated[Path, Option("-o", "--out", help="JSON file to write the results to")] = Path("rollout.json"),
     weights: Annotated[
         Path | None, Option(help="weights of the force field (.safetensors); default: those in the package")
-    ] = None,
-    keypoints: Annotated[int, Option(help="keypoints of each of the three objects")] = 2048,
-    steps: Annotated[int, Option(help="number of 0.02 s steps")] = 100,
-    scenes: Annotated[list[int], Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")] = [],  # noqa: B006
-    repeat: Annotated[int, Option(help="timed rollouts, of which the median counts")] = 5,
-    device: Device = "auto",
+    ] = RolloutBenchOptions.weights,
+    keypoints: Annotated[int, Option(help="keypoints of each of the three objects")] = RolloutBenchOptions.keypoints,
+    steps: Annotated[int, Option(help="number of 0.02 s steps")] = RolloutBenchOptions.steps,
+    scenes: Annotated[
+        list[int], Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")
+    ] = RolloutBenchOptions.scenes,
+    repeat: Annotated[int, Option(help="timed rollouts, of which the median counts")] = RolloutBenchOptions.repeat,
+    device: Device = RolloutBenchOptions.device,
     as_json: AsJson = False,
 ) -> None:
     """Learned force field: time of a rollout, compared with the published model and MPM."""
-    from stages.lab.bench.rollout import RolloutBenchOptions, run
+    from stages.lab.bench.rollout import run
 
     options = RolloutBenchOptions(
         weights=weights, keypoints=keypoints, steps=steps, scenes=tuple(scenes), repeat=repeat, device=device
@@ -97,18 +109,17 @@ def bench_chain(
         bool,
         Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
     ] = False,
-    quality: Quality = "normal",
-    device: Device = "auto",
-    steps: Annotated[int, Option(help="frames of the video")] = 100,
-    refine: Annotated[bool, Option(help="complete the objects before they are simulated")] = True,
-    repeat: Annotated[int, Option(help="runs in one process; the first one loads kernels")] = 2,
-    commands: Annotated[bool, Option(help="also run each stage as a command")] = True,
+    quality: Quality = ChainBenchOptions.quality,
+    device: Device = ChainBenchOptions.device,
+    steps: Annotated[int, Option(help="frames of the video")] = ChainBenchOptions.steps,
+    refine: Annotated[bool, Option(help="complete the objects before they are simulated")] = ChainBenchOptions.refine,
+    repeat: Annotated[int, Option(help="runs in one process; the first one loads kernels")] = ChainBenchOptions.repeat,
+    commands: Annotated[bool, Option(help="also run each stage as a command")] = ChainBenchOptions.commands,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """All stages from photos to a video: time, GPU utilisation, and whether repeated runs give equal files."""
-    from stages.lab.bench.chain import ChainBenchOptions, run
-    from stages.lab.bench.chain_table import ChainTableOptions
+    from stages.lab.bench.chain import run
     from stages.lab.bench.chain_table import run as run_table
 
     if table != (photos is None):

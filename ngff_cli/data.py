@@ -9,6 +9,7 @@ from typer.models import OptionInfo
 
 from ngff_cli.options import AsJson, Device, Keypoints, Out, SceneCount, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
+from stages.lab.clutter.options import ClutterOptions
 
 app = typer.Typer()
 
@@ -228,32 +229,34 @@ def heldout(
 def clutter(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
     meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
-    count: SceneCount = 20,
-    first: Annotated[int, Option(help="number of the first scene")] = 0,
-    photos: Annotated[int, Option(help="photos of each scene")] = 12,
-    size: Annotated[int, Option(help="longest side of a photo [px]")] = 512,
+    count: SceneCount = ClutterOptions.count,
+    first: Annotated[int, Option(help="number of the first scene")] = ClutterOptions.first,
+    photos: Annotated[int, Option(help="photos of each scene")] = ClutterOptions.photos,
+    size: Annotated[int, Option(help="longest side of a photo [px]")] = ClutterOptions.size,
     observations: Annotated[
         int,
         Option(
             help="write this many samples of a reconstruction-noise model per scene instead of photos; 0: write photos"
         ),
-    ] = 0,
+    ] = ClutterOptions.observations,
     reconstruct: Annotated[
         bool,
         Option(
             "--reconstruct",
             help="reconstruct the photos with their true cameras, and write the labelled result instead",
         ),
-    ] = False,
-    exact: Annotated[bool, Option("--exact", help="write the true Gaussians, labelled, not photos")] = False,
-    seed: Seed = 0,
-    device: Device = "auto",
+    ] = ClutterOptions.reconstruct,
+    exact: Annotated[
+        bool, Option("--exact", help="write the true Gaussians, labelled, not photos")
+    ] = ClutterOptions.exact,
+    seed: Seed = ClutterOptions.seed,
+    device: Device = ClutterOptions.device,
 ) -> None:
     """Generate labelled scenes of objects on tables, desks, shelves and floors, to train the segmentation.
 
     Without options, run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
     """
-    from stages.lab.clutter.scenes import ClutterOptions, run
+    from stages.lab.clutter.scenes import run
 
     options = ClutterOptions(
         count=count, first=first, photos=photos, size=size, observations=observations, reconstruct=reconstruct,

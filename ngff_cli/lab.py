@@ -8,6 +8,7 @@ from typer import Argument, Option
 
 from ngff_cli import bench, data, training
 from ngff_cli.options import AsJson, Device, SceneIn, Seed, Threads, new_app, print_results, run_command_line, set_up
+from stages.lab.bench.motion_options import EstimateOptions, ReplayOptions
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
 from stages.lab.track.options import TrackOptions
@@ -35,11 +36,11 @@ def doctor(as_json: AsJson = False) -> None:
 def replay(
     recording: Annotated[Path, Argument(metavar="RECORDING.npz", help="run of the published MPM solver")],
     out: Annotated[Path, Option("-o", "--out", help="our run to write, as RECORDING")] = Path("ours.npz"),
-    frames: Annotated[int, Option(help="number of frames; 0: all of the recording")] = 0,
-    device: Device = "auto",
+    frames: Annotated[int, Option(help="number of frames; 0: all of the recording")] = ReplayOptions.frames,
+    device: Device = ReplayOptions.device,
 ) -> None:
     """Repeat a recorded run of the published MPM solver with ours and print the differences."""
-    from stages.lab.bench.replay import ReplayOptions, run
+    from stages.lab.bench.replay import run
 
     for line in run(recording, out, ReplayOptions(frames=frames, device=device)):
         print(line)
@@ -65,15 +66,17 @@ def estimate_materials(
     out: MaterialsOut = Path("materials.json"),
     objects: Annotated[
         str, Option(help="names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
-    ] = "",
-    model: Annotated[str, Option(help="name of a model that accepts images; default: $OPENAI_MODEL")] = "",
-    timeout: Annotated[float, Option(help="maximum waiting time for a reply [s]")] = 120.0,
+    ] = EstimateOptions.objects,
+    model: Annotated[
+        str, Option(help="name of a model that accepts images; default: $OPENAI_MODEL")
+    ] = EstimateOptions.model,
+    timeout: Annotated[float, Option(help="maximum waiting time for a reply [s]")] = EstimateOptions.timeout,
 ) -> None:
     """Estimate the materials of the objects in a video with a vision-language model.
 
     Works with any endpoint that implements OpenAI's protocol: $OPENAI_BASE_URL, and $OPENAI_API_KEY if it needs a key.
     """
-    from stages.lab.bench.estimate_materials import EstimateOptions, run
+    from stages.lab.bench.estimate_materials import run
 
     for line in run(video, out, EstimateOptions(objects=objects, model=model, timeout=timeout)):
         print(line)
@@ -96,7 +99,7 @@ def fit(
     material: Annotated[
         list[str],
         Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine them; repeatable"),
-    ] = [],  # noqa: B006
+    ] = MaterialFitOptions.material,
     align: Annotated[
         bool,
         Option("--align", help="the track has another frame of reference: align it by shared cameras or objects"),

@@ -1,5 +1,6 @@
 """The command line: options, help, completion and the whole chain."""
 
+import ast
 import dataclasses
 import inspect
 import json
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from ngff_cli import app as commands
+from ngff_cli import bench_motion, bench_scenes, bench_speed, data, lab, training
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
 from ngff_cli.options import print_results
@@ -24,6 +26,7 @@ from tests.conftest import CliRunner
 from tests.reconstruct.raycast import arc, write_set
 
 ROOT = Path(__file__).resolve().parents[2]
+LAB_MODULES = (bench_motion, bench_scenes, bench_speed, data, lab, training)
 PIPELINE = ("reconstruct", "segment", "refine", "simulate", "render", "evaluate")
 # not in the Options classes
 NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against", "as_json", "context"}
@@ -65,6 +68,20 @@ def test_every_field_of_the_options_class_is_an_option_with_the_same_default(com
     assert list(given) == list(fields)
     for name, default in fields.items():
         assert given[name].default == (None if default == () else default), name
+
+
+@pytest.mark.parametrize("module", LAB_MODULES, ids=lambda module: module.__name__)
+def test_options_of_lab_commands_have_the_defaults_of_their_classes(module):
+    for command in ast.parse(inspect.getsource(module)).body:
+        calls = [node for node in ast.walk(command) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
+        for call in calls:
+            if dataclasses.is_dataclass(options := vars(module).get(call.func.id)):
+                parameters = inspect.signature(vars(module)[command.name]).parameters
+                fields = {f.name: f.default for f in dataclasses.fields(options)}
+                for word in call.keywords:
+                    names = {node.id for node in ast.walk(word.value) if isinstance(node, ast.Name)}
+                    for name in names & parameters.keys():
+                        assert parameters[name].default == fields[word.arg], f"{command.name} --{name}"
 
 
 def test_options_that_are_given_are_told_from_those_that_are_not(monkeypatch, tmp_path):

@@ -82,8 +82,9 @@ def test_class_names_are_unique(trees):
     assert not [name for name, count in names.items() if count > 1]
 
 
-def test_help_imports_nothing_heavy():
-    code = "import sys; sys.argv = ['ngff', '--help']\nimport ngff_cli.app as a\n"
+@pytest.mark.parametrize("command_line", ["app", "lab"])
+def test_help_imports_nothing_heavy(command_line):
+    code = f"import sys; sys.argv = ['ngff', '--help']\nimport ngff_cli.{command_line} as a\n"
     code += "try:\n a.main()\nexcept SystemExit: pass\n"
     code += f"print(sorted({HEAVY!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)

@@ -8,7 +8,8 @@ import torch
 from stages.core.geometry.neighbours import BruteForce
 from stages.core.geometry.rotations import matrix
 from stages.lab.assets.shapes import ellipsoid
-from stages.lab.bench.register import RegisterBenchOptions, errors, make_trial
+from stages.lab.bench.register import errors, make_trial
+from stages.lab.bench.scene_options import RegisterBenchOptions
 from stages.refine import registration, registration_cloud
 from stages.refine.registration import register
 from stages.refine.registration_cloud import RegistrationCloud, diameter

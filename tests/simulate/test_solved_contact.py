@@ -6,7 +6,8 @@ from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.lab.bench.experiments.catalogue import experiments
-from stages.lab.bench.physics import PhysicsBenchOptions, measure
+from stages.lab.bench.motion_options import PhysicsBenchOptions
+from stages.lab.bench.physics import measure
 from stages.simulate.engine_choice import with_engine
 from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene

@@ -10,7 +10,7 @@ import json
 import logging
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -20,48 +20,28 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
+from stages.lab.bench.motion_options import AblationBenchOptions
 from stages.lab.dataset.keypoint_motions import KeypointMotions, read_groups
 from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
 from stages.lab.training.ablation import ABLATIONS, Ablation
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, train_validation_split
 from stages.lab.training.distributed import ProcessGroup
+from stages.lab.training.options import TrainOptions
 from stages.lab.training.state import TrainingState
-from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, TrainOptions, validate
+from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, validate
 
 log = logging.getLogger(__name__)
 METRICS = ("RMSE", "FPE", "R")
 VALIDATION_CHECKS = 6  # validations in one training; the best weights are scored
 
 
-@dataclass(frozen=True)
-class AblationBenchOptions:
-    """Length and data of each training."""
-
-    steps: int = 1500
-    batch: int = 64
-    keypoints: int = 256
-    horizons: str = "8,20"
-    groups: str = "3_0..3_8"  # to train on; the last 100 scenes are for validation
-    test: str = "3_9"  # group to score on
-    compiled: bool = False
-    seed: int = 0
-    device: str = "auto"
-
-    def training(self) -> TrainOptions:
-        """Options of the full network's training."""
-        return TrainOptions(
-            steps=self.steps, batch=self.batch, keypoints=self.keypoints, horizons=self.horizons, loss="axes",
-            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=VALIDATION_CHECKS,
-        )  # fmt: skip
-
-
-def run(data: Path, out: Path, options: AblationBenchOptions = AblationBenchOptions(), only: str = "") -> Iterator[str]:
+def run(data: Path, out: Path, options: AblationBenchOptions, only: str = "") -> Iterator[str]:
     """Train each ablation, or those named in `only` (separated by commas); yield a line about each."""
     names = [name.strip() for name in only.split(",")] if only else list(ABLATIONS)
     unknown = [name for name in names if name not in ABLATIONS]
     if unknown:
         raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(ABLATIONS)}")
-    base, device = options.training(), pick_device(options.device)
+    base, device = _training(options), pick_device(options.device)
     asked = {k: v for k, v in asdict(options).items() if k != "device"}
     facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}
     for name in names:
@@ -143,3 +123,10 @@ def markdown(facts: dict) -> Iterator[str]:
 
 def _line(name: str, row: dict) -> str:
     return f"{name:12} RMSE {row['RMSE']:.4f}  FPE {row['FPE']:.4f}  R {row['R']:.3f}  without {row['without']}"
+
+
+def _training(options: AblationBenchOptions) -> TrainOptions:
+    """Options of the full network's training."""
+    chosen = asdict(options)
+    del chosen["test"]
+    return TrainOptions(**chosen, loss="axes", checks=VALIDATION_CHECKS)

@@ -29,8 +29,8 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import appearance_gsplat as peer
 from stages.lab.bench.common import machine, write_json
 from stages.lab.bench.reconstruct import photo_folder
+from stages.lab.bench.scene_options import AppearanceBenchOptions
 from stages.reconstruct import classic, sfm
-from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photometric import score_views
 from stages.reconstruct.photos import Photos, Reconstruction, Views
@@ -42,24 +42,6 @@ BLACK = (0.0, 0.0, 0.0)
 WARMUP_STEPS = 100  # steps that estimate gsplat's initial speed
 SPEED_FRACTION = 0.5  # mean speed / initial speed, as Gaussians multiply: first estimate
 MAX_TIME_RATIO = 1.15  # gsplat's time / ours: its first run is stopped here, and repeated if below the inverse
-
-
-@dataclass(frozen=True)
-class AppearanceBenchOptions:
-    """Options of the reconstruction."""
-
-    quality: str = "high"
-    holdout: int = 8
-    models: Path | None = None  # cache of each set's cameras and sparse points; None: estimate them
-
-    def __post_init__(self):
-        if self.holdout < 2:
-            raise InputError(f"--holdout {self.holdout}: give 2 or more, to hold out every N-th photo")
-        self.reconstruction()
-
-    def reconstruction(self) -> ReconstructOptions:
-        """Options of `ngff reconstruct`."""
-        return ReconstructOptions(quality=self.quality, holdout=self.holdout)
 
 
 @dataclass(frozen=True)

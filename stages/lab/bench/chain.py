@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,25 +22,10 @@ from stages.core.errors import InputError
 from stages.core.scene.files import sha256
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.bench.common import machine, write_results
+from stages.lab.bench.speed_options import ChainBenchOptions
 
 PAPER_SECONDS = {"without refine": 12, "with refine": 37}  # photos to film on one GPU, as the paper states
 SAMPLE_SECONDS = 0.05  # between readings of the GPU's utilisation
-
-
-@dataclass(frozen=True)
-class ChainBenchOptions:
-    """What is run."""
-
-    quality: str = "normal"
-    device: str = "auto"
-    steps: int = 100  # frames of the film
-    refine: bool = True
-    repeat: int = 2  # runs in this process; the first one loads kernels
-    commands: bool = True  # also run each stage as a command
-
-    def __post_init__(self):
-        if not 1 <= self.repeat <= 100:
-            raise InputError(f"--repeat {self.repeat}: 1 to 100")
 
 
 def command_lines(photos: Path, folder: Path, options: ChainBenchOptions) -> dict[str, list[str]]:
@@ -85,7 +69,7 @@ def stage_calls(photos: Path, folder: Path, options: ChainBenchOptions) -> dict[
     return {name: call for name, call in calls.items() if options.refine or name != "refine"}
 
 
-def run(photos: Path, out: Path | None = None, options: ChainBenchOptions = ChainBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(photos: Path, out: Path | None, options: ChainBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     device = pick_device(options.device)
     yield machine(device)

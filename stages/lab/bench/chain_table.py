@@ -9,35 +9,17 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.bench.chain import ChainBenchOptions, stage_calls, timed
+from stages.lab.bench.chain import stage_calls, timed
 from stages.lab.bench.common import machine, write_results
+from stages.lab.bench.speed_options import ChainBenchOptions, ChainTableOptions
 from stages.lab.track.stand_in import StandInOptions, write_photos
 
 STAGES = ("reconstruct", "segment", "refine", "simulate", "render")
 PAPER_SECONDS = {3: {True: 37, False: 12}, 6: {True: 72, False: 19}}  # by number of objects, with and without refine
-
-
-@dataclass(frozen=True)
-class ChainTableOptions:
-    """Which scenes are photographed, and how often each is run."""
-
-    objects: tuple[int, ...] = (3, 6)
-    photos: int = 20
-    width: int = 448  # of the photos [px]
-    quality: str = "normal"
-    steps: int = 100  # frames of the film
-    repeat: int = 2  # of which the last one counts: the first one loads kernels
-    device: str = "auto"
-
-    def __post_init__(self):
-        if not 1 <= self.repeat <= 100 or self.photos < 4 or not 64 <= self.width <= 4096:
-            raise InputError("--repeat must be 1 to 100; photos 4 or more, of 64 to 4096 px")
 
 
 def run(out: Path | None, options: ChainTableOptions) -> Iterator[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -31,6 +31,7 @@ from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.objects import ObjectsOptions, make_object
 from stages.lab.assets.shapes import sheet, to_gaussians
 from stages.lab.bench import common as bench
+from stages.lab.bench.scene_options import CompleteBenchOptions
 from stages.refine.library import transformed
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
@@ -43,19 +44,6 @@ FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera [degr
 SURFACE_DEPTH = 0.03 * OBJECT_SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
 COMPLETERS = ("none", "close", "library")
 METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
-
-
-@dataclass(frozen=True)
-class CompleteBenchOptions:
-    """Scenes, noise and simulation of the benchmark."""
-
-    scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # objects of each scene
-    known: str = ""  # objects of the library; empty: all ten
-    thin: int = 2  # every n-th Gaussian of an object is used
-    noise: float = 0.003  # standard deviation of positions [longest sides]
-    frames: int = 40  # frames of motion
-    lift: float = 0.2  # height that the objects are dropped from [m]
-    seed: int = 0
 
 
 def true_scene(object_names: str, options: CompleteBenchOptions) -> Scene:
@@ -135,7 +123,7 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
     return sum(values) / len(values)
 
 
-def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()) -> Iterator[str]:
+def run(out: Path | None, options: CompleteBenchOptions) -> Iterator[str]:
     """Yield a line for each scene and completer and the means over scenes; all figures go to `out` as JSON."""
     yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
     scenes = {}

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -41,6 +41,7 @@ from stages.lab.bench.dynamics_baselines import (
     shared_scenes,
 )
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
+from stages.lab.bench.motion_options import DynamicsBenchOptions
 from stages.lab.dataset import sensitivity
 from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_groups
 from stages.lab.training.history import total_minutes
@@ -58,22 +59,6 @@ FREE_FALL, NUDGED, RIGID_FIT, MPM_ESTIMATED = (
     "mpm-estimated",
 )
 NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *HELDOUT_SHAPES.items())}
-
-
-@dataclass(frozen=True)
-class DynamicsBenchOptions:
-    """Scenes, keypoints and the optional MPM row."""
-
-    keypoints: int = 256  # of an object; a model gets no more than it was trained with
-    limit: int = 0  # scenes of each split; 0: all
-    mpm: int = 100  # scenes of each split for mpm-estimated, which simulates them; 0: no such row
-    batch: int = 100  # scenes at once
-    seed: int = 0  # of the temporal sample
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.keypoints < 1 or self.batch < 1 or min(self.limit, self.mpm) < 0:
-            raise InputError("--keypoints must be positive, --limit and --mpm at least 0")
 
 
 def redraw(results: Path) -> list[str]:
@@ -94,7 +79,7 @@ def run(
     data: Path,
     folder: Path,
     out: Path,
-    options: DynamicsBenchOptions = DynamicsBenchOptions(),
+    options: DynamicsBenchOptions,
     nudged: Path | None = None,
 ) -> list[str]:
     """Measure every NAME.safetensors of a folder, and the rows without training, on every split of a data set.

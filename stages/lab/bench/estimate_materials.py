@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
@@ -17,6 +16,7 @@ from stages.core.scene.files import provenance, replacing
 from stages.core.scene.images import sample_frames
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.schema import quote
+from stages.lab.bench.motion_options import EstimateOptions
 
 log = logging.getLogger(__name__)
 RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
@@ -38,19 +38,7 @@ Answer with nothing but one JSON object, one entry for each object, for example
 {{"{example}": {{"material": "soft rubber", "E": 3e5, "density": 300}}}}"""
 
 
-@dataclass(frozen=True)
-class EstimateOptions:
-    """Model, frames shown, and number of attempts."""
-
-    objects: str = ""  # names separated by commas, or a scene.ply that holds them; empty: the model names the objects
-    model: str = ""  # empty: OPENAI_MODEL
-    timeout: float = 120.0  # of one request [s]
-    frames: int = 10  # evenly spaced
-    longest: int = 512  # longest side of a frame as sent [px]
-    tries: int = 3  # replies, before giving up
-
-
-def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) -> list[str]:
+def run(video: Path, out: Path, options: EstimateOptions) -> list[str]:
     """Write OUT for `ngff simulate --materials OUT`, and its provenance to OUT.json; a line about each object.
 
     Raises InputError for an unreadable video, an endpoint that fails, and replies that cannot be used.

@@ -14,13 +14,13 @@ from statistics import median
 import torch
 
 from stages.core.backends import load, pick_device
-from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.materials import Material
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, Trajectory
 from stages.lab.bench.common import write_results
 from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, cube
+from stages.lab.bench.motion_options import FIT_KINDS, FitBenchOptions
 from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, as_json, fitted
@@ -29,28 +29,6 @@ from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 KEYPOINTS, STEPS = 32, 50
 REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # largest error of identifiable parameters
-KINDS = ("slide", "bounce", "collision", "soft")
-
-
-@dataclass(frozen=True)
-class FitBenchOptions:
-    """Scenes, and how each is fitted."""
-
-    scenes: int = 20  # of the kinds in turn
-    only: str = ""  # one of KINDS; empty: all
-    truth: str = ""  # engine of the motions; empty: that which fits them
-    noise: float = 0.002  # of the track [m]
-    evaluations: int = 1500
-    minutes: float = 10.0  # for a scene
-    workers: int = 2
-    seed: int = 0
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.only and self.only not in KINDS:
-            raise InputError(f"--only {self.only}: choose from {', '.join(KINDS)}")
-        if self.truth and self.truth not in ENGINES:
-            raise InputError(f"--truth {self.truth}: choose from {', '.join(ENGINES)}")
 
 
 @dataclass(frozen=True)
@@ -149,7 +127,7 @@ def errors_of(fit: Fit, case: FitCase) -> list[dict]:
 def run(out: Path | None, options: FitBenchOptions) -> Iterator[str]:
     """Lines of a table of all scenes, and JSON in `out`."""
     device, results = pick_device(options.device), {}
-    kinds = [options.only] if options.only else KINDS
+    kinds = [options.only] if options.only else FIT_KINDS
     yield f"{'scene':<14} identifiable: error +- half width of its interval"
     for index in range(options.scenes):
         case = fit_case(index, kinds[index % len(kinds)], options.seed)

@@ -18,13 +18,13 @@ from pathlib import Path
 import torch
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.physics.materials import Material
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.toys import falling_toys
 from stages.lab.bench.common import write_results
+from stages.lab.bench.motion_options import FILM_KINDS, FilmBenchOptions
 from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
@@ -37,27 +37,6 @@ from stages.simulate.stage import run as simulate
 
 BLOCK = 2  # id in `falling_toys`
 AWAY_FROM = (0.16, 0.05, 0.0)  # from its place there to near the middle of the table [m]
-KINDS = ("slide", "throw")
-
-
-@dataclass(frozen=True)
-class FilmBenchOptions:
-    """What is filmed, and how it is fitted."""
-
-    scenes: int = 6  # of the kinds in turn
-    only: str = ""  # one of KINDS; empty: both
-    cameras: int = 2
-    width: int = 320  # of the films [px]
-    frames: int = 25
-    workers: int = 2
-    seed: int = 0  # of the first scene
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.only and self.only not in KINDS:
-            raise InputError(f"--only {self.only}: choose from {', '.join(KINDS)}")
-        if not (1 <= self.cameras <= 16 and 64 <= self.width <= 4096 and self.frames >= 3 and self.scenes >= 1):
-            raise InputError("--cameras must be 1 to 16, --width 64 to 4096, --frames 3 or more, --scenes 1 or more")
 
 
 @dataclass(frozen=True)
@@ -124,7 +103,7 @@ def errors(fit: Fit, toy: FilmedToy) -> list[dict]:
 def run(out: Path | None, options: FilmBenchOptions) -> Iterator[str]:
     """Lines of a table of all scenes, and JSON in `out`."""
     device, results = pick_device(options.device), {}
-    kinds = [options.only] if options.only else KINDS
+    kinds = [options.only] if options.only else FILM_KINDS
     for seed in range(options.seed, options.seed + options.scenes):
         kind = kinds[(seed - options.seed) % len(kinds)]
         results[f"{kind} {seed}"] = row = measure(kind, options, seed)

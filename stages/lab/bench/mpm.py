@@ -9,17 +9,16 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from stages.core.errors import InputError
 from stages.core.kernels.cuda_graphs import captured
 from stages.core.models.initial_conditions import GRAVITY
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm_three_kernel
+from stages.lab.bench.speed_options import MpmBenchOptions
 
 log = logging.getLogger(__name__)
 SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # as published
@@ -27,20 +26,6 @@ BODIES_PER_SCENE = 3
 PARTICLE_BYTES = 145  # read and written per particle and substep, without the grid
 STENCIL_NODES = 27  # of a particle's stencil: 16 bytes read and 16 bytes added each
 MATERIALS = ((8e5, 600.0), (1e5, 700.0), (3e5, 300.0))  # E [Pa], density [kg/m^3]: ball, panda, duck
-
-
-@dataclass(frozen=True)
-class MpmBenchOptions:
-    """Problem sizes; a batch is `scenes` copies of one scene."""
-
-    device: str = "auto"
-    particles: tuple[int, ...] = (6_144, 20_000, 250_000)
-    scenes: int = 0  # 0: as many as suit the device
-    frames: int = 10  # timed, after three of warm-up
-
-    def __post_init__(self):
-        if self.frames < 1 or self.scenes < 0 or not all(100 <= p <= 2_000_000 for p in self.particles):
-            raise InputError("--frames at least 1, --scenes at least 0, --particles 100 to 2,000,000")
 
 
 def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:

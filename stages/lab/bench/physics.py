@@ -8,8 +8,7 @@ import json
 import logging
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from fnmatch import fnmatch
 from pathlib import Path
@@ -23,38 +22,21 @@ from stages.lab.bench.common import machine, write_json
 from stages.lab.bench.experiments.bodies import Run
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.experiments.experiment import Experiment
+from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.stage import run as simulate
 
 FAILED = "failed"  # in place of a value, where the engine ended with an error
 
 
-@dataclass(frozen=True)
-class PhysicsBenchOptions:
-    """What is measured, with which engines."""
-
-    only: tuple[str, ...] = ()  # patterns of names, such as "slide*"; empty: all
-    engines: tuple[str, ...] = ("rigid", "mpm", "ngff")
-    quality: str = "draft"  # of MPM
-    keypoints: int = 256
-    weights: Path | None = None  # of the learned engine
-    contact: str = AUTO  # of the engine ngff
-    device: str = "auto"
-
-    def __post_init__(self):
-        unknown = [name for name in self.engines if name not in (AUTO, *ENGINES)]
-        if unknown:
-            raise InputError(f"--engine {unknown[0]}: choose from {', '.join((AUTO, *ENGINES))}")
-        SimulateOptions(contact=self.contact)  # raises for another
-
-    def chosen(self) -> list[Experiment]:
-        """The experiments whose name fits one of the patterns. Raises InputError where a pattern fits none."""
-        table = experiments()
-        for pattern in self.only:
-            if not any(_fits(name, pattern) for name in table):
-                groups = ", ".join(sorted({name.partition("/")[0] for name in table}))
-                raise InputError(f"--only {pattern}: fits no experiment; groups are {groups}")
-        return [e for name, e in table.items() if not self.only or any(_fits(name, p) for p in self.only)]
+def chosen(patterns: Sequence[str]) -> list[Experiment]:
+    """The experiments whose name fits one of the patterns, or all. Raises InputError where a pattern fits none."""
+    table = experiments()
+    for pattern in patterns:
+        if not any(_fits(name, pattern) for name in table):
+            groups = ", ".join(sorted({name.partition("/")[0] for name in table}))
+            raise InputError(f"--only {pattern}: fits no experiment; groups are {groups}")
+    return [e for name, e in table.items() if not patterns or any(_fits(name, p) for p in patterns)]
 
 
 def _fits(name: str, pattern: str) -> bool:
@@ -103,7 +85,7 @@ def _quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iterator[str]:
+def run(out: Path, options: PhysicsBenchOptions) -> Iterator[str]:
     """Yield a line for each experiment and engine; rows that `out` has already are kept and not measured again.
 
     Also writes the table beside it as Markdown. Raises InputError where `out` has rows of another quality.
@@ -115,7 +97,7 @@ def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iter
         if (before := facts.get(name, default)) != getattr(options, name):
             raise InputError(f"{out}: has rows measured at --{name} {before}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}
-    for experiment in options.chosen():
+    for experiment in chosen(options.only):
         row = facts["rows"].setdefault(experiment.name, {})
         for engine in options.engines:
             if engine not in row:

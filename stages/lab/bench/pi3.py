@@ -8,7 +8,6 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.models.pi3 import memory
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.dinov2 import PATCH
@@ -24,21 +22,7 @@ from stages.core.models.pi3.layers import Attention
 from stages.core.models.pi3.network import Pi3, halve
 from stages.core.models.pi3.splat import Pi3Splat
 from stages.lab.bench import common as bench
-
-
-@dataclass(frozen=True)
-class Pi3BenchOptions:
-    """Numbers of views, image size and repetitions."""
-
-    device: str = "auto"
-    views: tuple[int, ...] = (1, 8, 20, 50)
-    size: int = 448  # side of the square photos [px]
-    repeat: int = 3  # timed forward passes of each
-    splats: bool = False  # with the Gaussian head
-
-    def __post_init__(self):
-        if self.size < PATCH or self.size % PATCH or self.repeat < 1 or min(self.views, default=0) < 1:
-            raise InputError(f"--size must be a multiple of {PATCH}, --views and --repeat at least 1")
+from stages.lab.bench.speed_options import Pi3BenchOptions
 
 
 def naive_attention(q: Float[Tensor, "b h t d"], k: Float[Tensor, "b h t d"], v: Float[Tensor, "b h t d"]) -> Tensor:

@@ -17,7 +17,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from stages.core.errors import InputError
 from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.kernels.splat.ssim import ssim, ssim_reference
@@ -25,22 +24,11 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
 from stages.lab.bench.raster_per_pixel import bin_into_tiles, composite_per_pixel
+from stages.lab.bench.speed_options import RasterBenchOptions
 
 FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))
 FORWARD_BACKWARD = ((50_000, 448), (100_000, 448))
 SSIM_SIZE = 448  # of the images of the SSIM benchmark [px]
-
-
-@dataclass(frozen=True)
-class RasterBenchOptions:
-    """Repetitions and problem size."""
-
-    repeat: int = 15  # timed calls of each, of which the fastest counts
-    shrink: int = 1  # divides the numbers of Gaussians and pixels
-
-    def __post_init__(self):
-        if not 1 <= self.repeat <= 1000 or not 1 <= self.shrink <= 100:
-            raise InputError("--repeat 1 to 1000, --shrink 1 to 100")
 
 
 @dataclass(frozen=True)
@@ -151,7 +139,7 @@ def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat
     )
 
 
-def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOptions()) -> Iterator[str]:
+def run(out: Path | None, options: RasterBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     by = options.shrink

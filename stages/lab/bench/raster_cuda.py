@@ -21,7 +21,8 @@ from stages.core.raster.rasterise import NEAR, count_pairs, rasterise_packed
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
-from stages.lab.bench.raster import FORWARD, RasterBenchOptions, RasterCase, random_gaussians, view_camera
+from stages.lab.bench.raster import FORWARD, RasterCase, random_gaussians, view_camera
+from stages.lab.bench.speed_options import RasterBenchOptions
 from stages.reconstruct.photometric import FitOptions, fit_gaussians
 from stages.reconstruct.photos import Views
 

@@ -30,25 +30,9 @@ from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.cameras import Cameras, read_cameras
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.bench.common import machine, write_json
+from stages.lab.bench.scene_options import ReconstructBenchOptions
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ReconstructBenchOptions:
-    """Options of the reconstruction."""
-
-    quality: str = "normal"
-    holdout: int = 8
-    device: str = "auto"
-    matcher: str = "sift"
-    cameras: bool = False  # stop after the cameras, to compare matchers
-
-    def key(self, folder: Path) -> str:
-        """Name of a set's row in the results."""
-        matcher = "" if self.matcher == "sift" else f", {self.matcher}"
-        cameras = ", cameras" if self.cameras else ""
-        return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
 
 
 @dataclass(frozen=True)

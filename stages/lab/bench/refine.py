@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.errors import InputError
 from stages.core.geometry.cameras import orbit
 from stages.core.perception.visibility import downscaled_views
 from stages.core.raster.rasterise import rasterise, visibility
@@ -26,24 +25,13 @@ from stages.core.scene.scene import Scene
 from stages.lab.assets.backgrounds import TABLE_HEIGHT
 from stages.lab.assets.tabletops import CAMERA_DISTANCE, tabletop
 from stages.lab.bench import common as bench
+from stages.lab.bench.scene_options import RefineBenchOptions
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
 
 NOVEL_VIEWS = 4  # views from above the photos' cameras
 MAX_HIDDEN_WEIGHT = 0.02  # a table Gaussian of less weight in every photo was not seen [px]
 MIN_TABLE_ALPHA = 0.9  # alpha of a pixel that shows the table
-
-
-@dataclass(frozen=True)
-class RefineBenchOptions:
-    """Number of scenes and of cameras of each."""
-
-    scenes: int = 4
-    views: int = 24
-
-    def __post_init__(self):
-        if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
-            raise InputError("--scenes 1 to 100, --views 8 to 200")
 
 
 @torch.no_grad()
@@ -93,7 +81,7 @@ def measure(index: int, views: int) -> dict:
     }  # fmt: skip
 
 
-def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOptions()) -> Iterator[str]:
+def run(out: Path | None, options: RefineBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     rows = []

@@ -29,6 +29,7 @@ from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.objects import ObjectsOptions, make_object
 from stages.lab.bench import common as bench
+from stages.lab.bench.scene_options import RegisterBenchOptions
 from stages.refine.registration import register
 from stages.refine.registration_cloud import cloud_colours, diameter
 
@@ -41,19 +42,6 @@ SURFACES_OF_REVOLUTION = (
 MAX_SYMMETRY_RESIDUAL = 0.002  # RMS change of positions and colours by a symmetry [diameters]
 SPLATREG_GAUSSIANS = 400  # of each cloud given to splatreg; its time grows with their square
 SPLATREG_RADIUS = 0.14  # RMS radius that splatreg's absolute tolerances suit [m]
-
-
-@dataclass(frozen=True)
-class RegisterBenchOptions:
-    """Objects, number of trials and the damage to each part."""
-
-    only: str = ""  # names separated by commas; empty: all ten objects
-    trials: int = 10  # parts of each object
-    missing: float = 0.4  # fraction of the surface
-    noise: float = 0.01  # standard deviation of positions [diameters]
-    tint: float = 0.02  # standard deviation of colours [0..1]
-    seed: int = 0
-    device: str = "auto"  # of the Gaussians
 
 
 @dataclass(frozen=True)
@@ -189,7 +177,7 @@ if find_spec("splatreg"):
     METHODS["splatreg"] = splatreg
 
 
-def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()) -> Iterator[str]:
+def run(out: Path | None, options: RegisterBenchOptions) -> Iterator[str]:
     """Register the same parts with every method; yield a line for each object. All trials go to `out` as JSON."""
     names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
     yield f"{'correct of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)

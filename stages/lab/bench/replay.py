@@ -24,6 +24,7 @@ from stages.core.kernels.mpm.constitutive import COROTATED
 from stages.core.physics.mpm import solver as mpm
 from stages.core.scene.files import replacing
 from stages.core.scene.npz import read_npz
+from stages.lab.bench.motion_options import ReplayOptions
 
 log = logging.getLogger(__name__)
 RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
@@ -32,18 +33,6 @@ SCALARS = ("nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "rpic_damping
 WALL_LAYERS = 3  # layers of nodes outside the walls
 WALL_DAMPING = 0.9  # factor on the tangential velocity at a wall, every substep
 CONTACT_DEVIATION = 1e-3  # deviation from free fall that shows a contact [drop heights]
-
-
-@dataclass(frozen=True)
-class ReplayOptions:
-    """Length and device of the run."""
-
-    frames: int = 0  # of the recording, the first counted; 0: all
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.frames < 0:
-            raise InputError("--frames must be 0 (all of the recording) or more")
 
 
 @dataclass(frozen=True)
@@ -143,7 +132,7 @@ def report(c: ReplayErrors) -> Iterator[str]:
     yield f"centres of mass agree to 1 % of the drop height through frame {last} of {len(c.com) - 1}"
 
 
-def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:
+def run(recording: Path, out: Path, options: ReplayOptions) -> Iterator[str]:
     """Replay RECORDING.npz into OURS.npz and yield the lines of a report."""
     data = read_recording(recording)
     frames = options.frames or len(data["positions"])

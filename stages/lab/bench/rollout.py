@@ -13,7 +13,6 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -23,33 +22,17 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.models import checkpoints
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper, record_frames
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
+from stages.lab.bench.speed_options import RolloutBenchOptions
 
 log = logging.getLogger(__name__)
 SCENE_OBJECTS = 3
 PEER = "ngff-paper, step by step"  # the baseline, as published
-
-
-@dataclass(frozen=True)
-class RolloutBenchOptions:
-    """Model and size of the rollouts."""
-
-    weights: Path | None = None  # of our force field; None: the shipped ones
-    keypoints: int = 2048  # of an object
-    steps: int = 100
-    scenes: tuple[int, ...] = ()  # batch sizes; empty: 1 and, on a GPU, 64
-    repeat: int = 5  # timed rollouts, of which the median counts
-    device: str = "auto"
-
-    def __post_init__(self):
-        if min((self.keypoints, self.steps, self.repeat, *self.scenes)) < 1:
-            raise InputError("--keypoints, --steps, --scenes and --repeat must be at least 1")
 
 
 def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
@@ -62,7 +45,7 @@ def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
     return InitialConditions.of(points.repeat(scenes, 1, 1, 1), mass=mass, E=E)
 
 
-def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iterator[str]:
+def run(out: Path, options: RolloutBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; results go to the JSON file `out`, which keeps those of other devices."""
     device = pick_device(options.device)
     model, card = checkpoints.load(checkpoints.find("ngff", options.weights), device)

@@ -13,7 +13,7 @@ import logging
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from stages.core.scene.scene import Scene
 from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
 from stages.lab.bench import common as bench
 from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visible_labels
+from stages.lab.bench.scene_options import SegmentBenchOptions
 from stages.segment.boxes import segment as boxes_segment
 from stages.segment.options import BACKENDS, SegmentOptions
 
@@ -36,21 +37,6 @@ log = logging.getLogger(__name__)
 ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and pixels in each photo
 AUTOMATIC = ("geometric", "learned")  # backends that need no prompts and no further weights
 MASK_SHIFT = 20  # standard deviation of the shift of masks at an error rate of 1 [px]
-
-
-@dataclass(frozen=True)
-class SegmentBenchOptions:
-    """Scenes and methods; two scenes show all ten objects."""
-
-    scenes: int = 4  # of each arrangement
-    views: int = 24  # cameras of a scene
-    weights: Path | None = None  # of SAM 2.1; None: the default locations
-    device: str = "auto"  # of SAM 2.1
-    reconstruct: bool = False  # also from rendered photos: minutes per scene
-
-    def __post_init__(self):
-        if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
-            raise InputError("--scenes 1 to 100, --views 8 to 200")
 
 
 def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
@@ -208,7 +194,7 @@ def _scores(scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
-def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:
+def run(out: Path | None, options: SegmentBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     networks, absent = available_networks(options)

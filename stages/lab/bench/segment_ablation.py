@@ -24,12 +24,14 @@ from stages.core.models.segmenter.voxels import FEATURES, LAB, SCALES
 from stages.core.scene.files import replacing
 from stages.evaluate.labels import LabelOverlap, PanopticScores
 from stages.lab.bench import common as bench
+from stages.lab.bench.scene_options import SegmentAblationData, SegmentAblationOptions
 from stages.lab.clutter.examples import Example, read_example
 from stages.lab.clutter.scenes import EXACT, OBSERVED, RECONSTRUCTED
 from stages.lab.training.distributed import ProcessGroup
+from stages.lab.training.options import SegmenterTraining
 from stages.lab.training.segmenter_data import Targets, find_examples
 from stages.lab.training.segmenter_scores import MIN_SURFELS, fit_scores
-from stages.lab.training.train_segmenter import SegmenterTraining, fit_network
+from stages.lab.training.train_segmenter import fit_network
 
 log = logging.getLogger(__name__)
 COLOUR_INPUTS = tuple(range(FEATURES))[LAB]
@@ -87,35 +89,10 @@ ABLATIONS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class SegmentAblationOptions:
-    """Length of the trainings."""
-
-    steps: int = 1500
-    voxels: int = 14_000
-    batch: int = 4
-    workers: int = 0
-    seed: int = 0
-    device: str = "auto"
-
-    def training(self) -> SegmenterTraining:
-        """Options of each network's training."""
-        return SegmenterTraining(**TRAINING, **asdict(self))
-
-
-@dataclass(frozen=True)
-class SegmentAblationData:
-    """Folders of scenes as `ngff-lab clutter --reconstruct` and `--exact` write; no scene may be in two of them."""
-
-    train: Sequence[Path]  # with reconstructions, and the true Gaussians of the same scenes
-    scores: Sequence[Path]
-    judge: Sequence[Path]
-
-
 def run(
     data: SegmentAblationData,
     out: Path,
-    options: SegmentAblationOptions = SegmentAblationOptions(),  # noqa: B008 -- frozen
+    options: SegmentAblationOptions,
     only: Sequence[str] = (),
 ) -> Iterator[str]:
     """Train each ablation, or those named in `only`; yields a line about each. OUT is JSON, with a table beside it."""
@@ -125,7 +102,7 @@ def run(
     device = pick_device(options.device)
     facts = {"options": asdict(options), "machine": bench.machine(device), "rows": {}}
     for name in names:
-        facts["rows"][name] = measured(ABLATIONS[name], data, options.training(), device)
+        facts["rows"][name] = measured(ABLATIONS[name], data, SegmenterTraining(**TRAINING, **asdict(options)), device)
         bench.write_json(out, facts)
         with replacing(out.with_suffix(".md")) as part:
             part.write_text("\n".join(_markdown(facts)) + "\n")

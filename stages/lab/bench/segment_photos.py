@@ -10,7 +10,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -27,24 +27,14 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.lab.bench import common as bench
 from stages.lab.bench.reconstruct import photo_folder
+from stages.lab.bench.scene_options import SegmentPhotosOptions
 
 METRICS = {"recall": "recall", "PQ": "PQ", "SQ": "SQ", "RQ": "RQ", "IoU": "mean IoU"}  # key: heading
 HEADINGS = ["set", "photos placed", "labelled", "objects", "found", *METRICS.values(), "false share", "PQ by labels",
             "reconstruct", "segment"]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class SegmentPhotosOptions:
-    """Where labels and ready scenes are."""
-
-    labels: Path | None = None  # folder of label images, or of such folders named as the sets; default: SET/labels
-    labelled: Path | None = None  # folder of labelled scenes SET.ply: used where present, otherwise made and kept there
-    device: str = "auto"  # of the reconstruction
-
-
-def run(
-    sets: list[Path], out: Path | None = None, options: SegmentPhotosOptions = SegmentPhotosOptions()
-) -> Iterator[str]:
+def run(sets: list[Path], out: Path | None, options: SegmentPhotosOptions) -> Iterator[str]:
     """Yield a line for each set; all results go to `out` as JSON, and as a table to a Markdown file beside it.
 
     The row of a set that cannot be reconstructed holds the error message.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix, rotation_angle
 from stages.core.geometry.similarity import Similarity, umeyama
@@ -23,6 +22,7 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.lab.bench.common import write_results
+from stages.lab.bench.motion_options import TrackBenchOptions
 from stages.lab.track.options import TrackOptions
 from stages.lab.track.stand_in import (
     KEYPOINTS,
@@ -36,30 +36,12 @@ from stages.lab.track.stand_in import (
 )
 from stages.lab.track.track import run as track
 from stages.reconstruct.filmed_sequence import read_sequence
-from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
+from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run as reconstruct
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run as segment
 
 MATCHED = 0.06  # largest distance of an object that was found from the true one, at the release [m]
-
-
-@dataclass(frozen=True)
-class TrackBenchOptions:
-    """Which stand-ins are filmed and tracked."""
-
-    sequences: int = 5
-    first: int = 0  # seed of the first sequence
-    width: int = 240  # of the films [px]
-    frames: int = 50
-    quality: str = ""  # at which scenes are reconstructed from their films; empty: the true scene is tracked
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.sequences < 1 or self.frames < 20 or not 64 <= self.width <= 4096:
-            raise InputError("--sequences must be 1 or more, --frames 20 or more and --width 64 to 4096")
-        if self.quality and self.quality not in QUALITY_PRESETS:
-            raise InputError(f"--reconstructed {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
 
 
 class PoseErrors(NamedTuple):

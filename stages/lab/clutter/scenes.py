@@ -34,6 +34,7 @@ from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.drapes import random_drapes
 from stages.lab.clutter.examples import Example, labelled, write_example
 from stages.lab.clutter.noise_model import observed
+from stages.lab.clutter.options import ClutterOptions
 from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
 from stages.lab.clutter.reconstruction import reconstructed
 from stages.lab.clutter.settle import hull_corners, settle
@@ -51,25 +52,6 @@ ROW_SHARE = 0.35  # of scenes with a row of books on edge
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
 CLOSE_SHARE = 0.15  # of scenes of one to three things photographed from nearby
 CLOSE_SIZES = 0.5, 1.2  # their longest sides [camera distance]
-
-
-@dataclass(frozen=True)
-class ClutterOptions:
-    """How many scenes, and what they are made of."""
-
-    count: int = 20
-    first: int = 0  # number of the first scene, which decides its content together with the seed
-    photos: int = 12
-    size: int = 512  # longest side of the photos [px]
-    observations: int = 0  # by the noise model, in place of photos and the true scene; 0: photos to reconstruct
-    reconstruct: bool = False  # write an observation of the reconstructed photos, in place of them and the true scene
-    exact: bool = False  # write an observation of the true Gaussians, in place of photos
-    seed: int = 0
-    device: str = "auto"  # of the reconstruction
-
-    def __post_init__(self):
-        if self.count < 1 or not 4 <= self.photos <= 200 or not 64 <= self.size <= 4096 or self.observations < 0:
-            raise InputError("--count 1 or more, --photos 4 to 200, --size 64 to 4096, --observations 0 or more")
 
 
 class Shelf:

@@ -13,7 +13,7 @@ from stages.core.models.dynamics import Dynamics
 from stages.core.models.field.contact_forces import ContactNet, ContactPoints
 from stages.core.models.field.force_field import FieldScene, ForceField
 from stages.core.models.field.rest_shape import RestShape
-from stages.lab.training.train import TrainOptions
+from stages.lab.training.options import TrainOptions
 
 IMPULSE_VECTORS = 2  # last vector features of a contact: impulses that stop its motion, and its normal motion
 

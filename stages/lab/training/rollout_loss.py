@@ -23,7 +23,6 @@ from stages.lab.training.data import MotionClip, smooth_motion
 
 log = logging.getLogger(__name__)
 UNIT = 0.01  # errors count in centimetres, so that gradients are of order one [m]
-LOSSES = ("square", "scene", "axes", "relative")
 ERROR_FLOOR = 0.1  # added in quadrature to errors before the root: a millimetre [UNIT]
 MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # floor, and reference value, of the motion that "relative" divides by [UNIT]
 

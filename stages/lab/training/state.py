@@ -20,7 +20,6 @@ GRADIENT_NORM_DECAY = 0.99  # of that moving average
 WARMUP_STEPS = 200  # steps until the full learning rate
 DIVERGENCE_RATIO = 1.25  # training has diverged at this multiple of the lowest RMSE so far,
 MAX_WORSENING_CHECKS = 4  # or when this many consecutive validations were each worse than the one before
-OPTIMIZERS = ("adamw", "soap")
 
 
 class TrainingState:

@@ -25,12 +25,12 @@ from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, describe_groups, train_validation_split
 from stages.lab.training.distributed import ProcessGroup, process_group
 from stages.lab.training.history import curve_columns, runs_of
-from stages.lab.training.rollout_loss import LOSSES, LossOptions, RolloutLoss
-from stages.lab.training.state import OPTIMIZERS, TrainingState
+from stages.lab.training.options import TrainOptions
+from stages.lab.training.rollout_loss import LossOptions, RolloutLoss
+from stages.lab.training.state import TrainingState
 from stages.lab.training.widen import widen
 
 log = logging.getLogger(__name__)
-HORIZON_FRACTIONS = (0.35, 0.35, 0.3)  # of the budget, for three horizons
 PROGRESS_LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
@@ -40,66 +40,8 @@ VALIDATION_FRAMES = 80  # of the rollouts that select the weights
 SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # of the selected weights, in a card
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    """Budget, batches, loss and optimizer of a training run."""
-
-    minutes: float = 20.0  # budget, validation included
-    steps: int = 0  # budget in optimizer steps instead, when not 0: the same on every machine
-    batch: int = 32  # scenes a step
-    keypoints: int = 256  # of an object
-    sparse_keypoints: int = 0  # keypoints of an object in every fourth step, for robustness to their number; 0: never
-    lr: float = 1e-3  # peak learning rate
-    horizons: str = "8,20,40"  # frames of a rollout, one phase each
-    width: int = 0  # width of the network; 0: the model's own
-    loss: str = "scene"  # one of rollout_loss.LOSSES
-    optimizer: str = "adamw"  # one of state.OPTIMIZERS
-    velocity_weight: float = 0.0  # time over which a velocity error counts as a position error [s]; 0: none
-    gradient_discount: float = 0.9  # factor on a gradient per frame of backpropagation
-    groups: str = "3_0..3_8"  # training files; the last scenes of the last are for validation
-    compiled: bool = False  # compile a step first: takes minutes, then faster; for GPUs
-    seed: int = 0
-    device: str = "auto"
-    checks: int = 24  # validations and checkpoints in the whole run
-
-    def __post_init__(self):
-        if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
-            raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
-        if not 0 <= self.sparse_keypoints <= self.keypoints:
-            raise InputError(f"--sparse-keypoints {self.sparse_keypoints}: must be between 0 and --keypoints")
-        if self.velocity_weight < 0:
-            raise InputError(f"--velocity-weight {self.velocity_weight}: a time in seconds, or 0")
-        if not 0 <= self.gradient_discount <= 1:
-            raise InputError(f"--gradient-discount {self.gradient_discount}: must be between 0 and 1")
-        if self.loss not in LOSSES:
-            raise InputError(f"--loss {self.loss}: choose from {', '.join(LOSSES)}")
-        if self.optimizer not in OPTIMIZERS:
-            raise InputError(f"--optimizer {self.optimizer}: choose from {', '.join(OPTIMIZERS)}")
-        if min(self.frames) < 1:
-            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
-
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """The horizons as numbers. Raises InputError where they are none."""
-        try:
-            return tuple(int(word) for word in self.horizons.split(","))
-        except ValueError as error:
-            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}") from error
-
-    def horizon(self, progress: float) -> int:
-        """Frames of a rollout at this fraction of the budget."""
-        n = len(self.frames)
-        fractions = HORIZON_FRACTIONS
-        ends = [sum(fractions[: i + 1]) if n == len(fractions) else (i + 1) / n for i in range(n)]
-        return self.frames[min(sum(progress >= e for e in ends), n - 1)]
-
-    def rate(self, progress: float) -> float:
-        """Learning rate at this fraction of the budget: half a cosine down to a hundredth."""
-        return self.lr * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
-
-
 def run(
-    model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False,
+    model: str, data: Path, out: Path, options: TrainOptions, resume: bool = False,
     start: Path | None = None,
 ) -> list[str]:  # fmt: skip
     """Train on groups of motions; write the best weights to OUT and their card next to it. Returns lines of result.

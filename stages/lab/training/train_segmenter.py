@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,13 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.models.segmenter.network import OFFSET_UNIT, SCORES, Prediction, Segmenter, pyramid
 from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
 from stages.core.scene.files import replacing, sha256
 from stages.lab.clutter.examples import read_example
 from stages.lab.training.distributed import ProcessGroup, process_group
+from stages.lab.training.options import SegmenterTraining
 from stages.lab.training.segmenter_data import (
     Targets,
     augmented,
@@ -36,28 +36,6 @@ from stages.lab.training.segmenter_scores import fit_scores
 
 CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])
 REPORT_STEPS = 50
-
-
-@dataclass(frozen=True)
-class SegmenterTraining:
-    """Settings of the training."""
-
-    minutes: float = 30.0  # of the network; 0: its weights stay as they are
-    steps: int = 0  # 0: as many as fit in `minutes`
-    rate: float = 2e-3
-    voxels: int = 14_000  # of a training crop
-    batch: int = 1  # crops per step, of each process
-    workers: int = 0  # processes that prepare crops; 0: the training process
-    seed: int = 0
-    device: str = "auto"
-    widths: tuple[int, ...] = (32, 48, 64, 96)
-    blocks: int = 2  # residual blocks of each level, down and up
-    score_scenes: int = 200  # augmented examples whose candidates train the scores
-    score_steps: int = 3000
-
-    def __post_init__(self):
-        if not (self.minutes >= 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
-            raise InputError("--rate must be above 0, --minutes 0 or more, --voxels at least 1000, --batch at least 1")
 
 
 def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:

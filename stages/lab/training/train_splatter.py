@@ -11,7 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -32,6 +32,7 @@ from stages.core.models.pi3.weights import find, load
 from stages.core.raster.rasterise import Rendering, rasterise
 from stages.core.scene.files import replacing, sha256
 from stages.lab import plot
+from stages.lab.training.options import SplatterOptions
 from stages.lab.training.splatter_data import WHITE, PosedViews, read_training_scenes
 from stages.reconstruct.depth import unproject
 
@@ -39,28 +40,6 @@ log = logging.getLogger(__name__)
 SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM (the rest is L1) and of the relative depth error
 CHECKS = 10  # validations in a run
 TRAINED_MODULES = ("feature_decoder", "feature_head")
-
-
-@dataclass(frozen=True)
-class SplatterOptions:
-    """Length, views, depth and optimizer of a training run."""
-
-    steps: int = 20_000  # of the optimizer
-    views: int = 4  # from which Gaussians are predicted in a step; one more is rendered
-    side: int = 448  # longest side of an image [px]
-    depth: str = "network"  # of the Gaussians: predicted by the network, or the true depth of rendered scenes ("given")
-    width: int = 0  # 0: start from weights; else a small random network of this width, for trials
-    lr: float = 1e-4  # peak learning rate
-    seed: int = 0
-    device: str = "auto"
-
-    def __post_init__(self):
-        if min(self.steps, self.views) < 1 or self.side < 14 or self.lr <= 0:
-            raise InputError("--steps, --views and --lr must be positive, --side at least 14")
-        if self.depth not in ("network", "given"):
-            raise InputError(f"--depth {self.depth}: choose from network, given")
-        if self.width % 16:
-            raise InputError(f"--width {self.width}: must be a multiple of 16")
 
 
 def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = None) -> Iterator[str]:

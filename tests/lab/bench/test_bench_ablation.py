@@ -13,10 +13,11 @@ from stages.core.models.field.contact_points import ARM_UNIT, pair_contacts
 from stages.core.models.field.rest_shape import rest_shape_of
 from stages.core.models.initial_conditions import InitialConditions
 from stages.lab.bench import ablation as bench_ablation
-from stages.lab.bench.ablation import AblationBenchOptions, run
+from stages.lab.bench.ablation import run
+from stages.lab.bench.motion_options import AblationBenchOptions
 from stages.lab.dataset.keypoint_motions import write_motions
 from stages.lab.training.ablation import ABLATIONS, IMPULSE_VECTORS
-from stages.lab.training.train import TrainOptions
+from stages.lab.training.options import TrainOptions
 from tests.conftest import CliRunner
 from tests.lab.training.motions import falling
 

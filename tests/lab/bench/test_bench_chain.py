@@ -7,7 +7,7 @@ import pytest
 from stages.core.errors import InputError
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.bench import chain
-from stages.lab.bench.chain import ChainBenchOptions
+from stages.lab.bench.speed_options import ChainBenchOptions
 from tests.conftest import two_balls_scene
 
 

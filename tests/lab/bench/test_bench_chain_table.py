@@ -7,7 +7,7 @@ import pytest
 from ngff_cli.lab import app
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.bench import chain_table
-from stages.lab.bench.chain_table import ChainTableOptions
+from stages.lab.bench.speed_options import ChainTableOptions
 from tests.conftest import CliRunner, two_balls_scene
 
 SMALL = ChainTableOptions(objects=(3, 6), photos=4, width=64, repeat=1)

@@ -12,7 +12,6 @@ from stages.lab.bench.complete import (
     COMPLETERS,
     FRONT_AZIMUTH,
     METRICS,
-    CompleteBenchOptions,
     camera_arc,
     chamfer_mm,
     psnr_behind,
@@ -21,6 +20,7 @@ from stages.lab.bench.complete import (
     visible,
     visible_scene,
 )
+from stages.lab.bench.scene_options import CompleteBenchOptions
 from tests.refine.sample_objects import asymmetric_object
 from tests.segment.tabletop import coloured_gaussians
 

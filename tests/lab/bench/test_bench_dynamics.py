@@ -23,7 +23,6 @@ from stages.lab.bench.dynamics import (
     NUDGED,
     RIGID_FIT,
     SPLITS,
-    DynamicsBenchOptions,
     evaluate_predictor,
     run,
     split_scenes,
@@ -39,6 +38,7 @@ from stages.lab.bench.dynamics_baselines import (
     with_estimated_materials,
 )
 from stages.lab.bench.dynamics_report import markdown, table
+from stages.lab.bench.motion_options import DynamicsBenchOptions
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, write_motions
 from stages.lab.dataset.object_particles import Asset, particle_volumes
 from stages.lab.dataset.scene_configs import SceneConfig, write_scene_configs

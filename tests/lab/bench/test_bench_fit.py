@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import pytest
 
 from stages.core.errors import InputError
-from stages.lab.bench.fit import KINDS, FitBenchOptions, errors_of, fit_case, measure, summary
+from stages.lab.bench.fit import errors_of, fit_case, measure, summary
+from stages.lab.bench.motion_options import FIT_KINDS, FitBenchOptions
 
 
 def test_scenes_are_drawn_by_seed_and_index():
-    for index, kind in enumerate(KINDS):
+    for index, kind in enumerate(FIT_KINDS):
         case = fit_case(index, kind, 0)
         same, other = (fit_case(index, kind, seed) for seed in (0, 1))
         assert (case.materials, case.seen, case.other) == (same.materials, same.seen, same.other)

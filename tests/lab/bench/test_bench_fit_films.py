@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.lab.bench.fit_films import KINDS, FilmBenchOptions, filmed_toy, run
+from stages.lab.bench.fit_films import filmed_toy, run
+from stages.lab.bench.motion_options import FILM_KINDS, FilmBenchOptions
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FILM_KINDS)
 def test_toys_are_drawn_by_seed(kind):
     toy, same, other = (filmed_toy(kind, 2, 128, seed) for seed in (0, 0, 1))
     assert (toy.material, toy.velocity) == (same.material, same.velocity) and toy.material != other.material

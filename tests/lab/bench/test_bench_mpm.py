@@ -10,7 +10,7 @@ from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import mpm as bench_mpm
 from stages.lab.bench import mpm_three_kernel
-from stages.lab.bench.mpm import MpmBenchOptions
+from stages.lab.bench.speed_options import MpmBenchOptions
 
 
 def test_three_kernel_form_equals_the_solver():

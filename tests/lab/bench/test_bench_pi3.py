@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from stages.core.errors import InputError
 from stages.core.models.pi3.network import Pi3
 from stages.lab.bench import pi3 as bench_pi3
-from stages.lab.bench.pi3 import Pi3BenchOptions, measure, naive_attention, run, set_attention
+from stages.lab.bench.pi3 import measure, naive_attention, run, set_attention
+from stages.lab.bench.speed_options import Pi3BenchOptions
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 from tests.core.models.pi3.test_splat import TINY_SPLAT
 

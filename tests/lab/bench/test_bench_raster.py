@@ -7,7 +7,8 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.raster.rasterise import rasterise
-from stages.lab.bench.raster import RasterBenchOptions, random_gaussians, render_per_pixel, run, view_camera
+from stages.lab.bench.raster import random_gaussians, render_per_pixel, run, view_camera
+from stages.lab.bench.speed_options import RasterBenchOptions
 
 
 def test_baseline_equals_the_rasteriser():

@@ -15,15 +15,8 @@ from stages.core.geometry.similarity import Similarity, umeyama
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench import common as bench
 from stages.lab.bench import register as bench_register
-from stages.lab.bench.register import (
-    RegisterBenchOptions,
-    errors,
-    icp,
-    make_trial,
-    nearest_z_rotation,
-    run,
-    splatreg,
-)
+from stages.lab.bench.register import errors, icp, make_trial, nearest_z_rotation, run, splatreg
+from stages.lab.bench.scene_options import RegisterBenchOptions
 from tests.refine.sample_objects import asymmetric_object, random_similarity
 from tests.segment.tabletop import coloured_gaussians
 

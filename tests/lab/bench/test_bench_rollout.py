@@ -8,7 +8,8 @@ import torch
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import build, save
 from stages.lab.bench import rollout as bench_rollout
-from stages.lab.bench.rollout import PEER, RolloutBenchOptions, ellipsoids, rollout_stepwise, run, table
+from stages.lab.bench.rollout import PEER, ellipsoids, rollout_stepwise, run, table
+from stages.lab.bench.speed_options import RolloutBenchOptions
 
 
 def test_scene_has_contacts():

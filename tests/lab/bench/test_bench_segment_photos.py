@@ -9,7 +9,8 @@ from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.scene.images import write_labels, write_png
 from stages.core.scene.scene_ply import write_scene
-from stages.lab.bench.segment_photos import SegmentPhotosOptions, labels_of, run
+from stages.lab.bench.scene_options import SegmentPhotosOptions
+from stages.lab.bench.segment_photos import labels_of, run
 from tests.conftest import CliRunner
 from tests.evaluate.test_labels import NAMES, SIZE, billboards, picture
 

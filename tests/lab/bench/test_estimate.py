@@ -18,7 +18,8 @@ from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import estimate_materials as estimate
 from stages.lab.bench.dynamics_baselines import VLM_MATERIALS
-from stages.lab.bench.estimate_materials import RANGES, EstimateOptions, parse_reply, run
+from stages.lab.bench.estimate_materials import RANGES, parse_reply, run
+from stages.lab.bench.motion_options import EstimateOptions
 from tests.chat_server import KEY
 from tests.conftest import CliRunner
 

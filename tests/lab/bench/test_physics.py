@@ -10,7 +10,8 @@ from stages.core.errors import InputError
 from stages.core.physics import solid_surface
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.experiments.friction import leaning_angle
-from stages.lab.bench.physics import PhysicsBenchOptions, measure, run
+from stages.lab.bench.motion_options import PhysicsBenchOptions
+from stages.lab.bench.physics import chosen, measure, run
 from stages.simulate.options import QUALITIES, MpmQuality
 
 ALL = experiments()
@@ -88,6 +89,6 @@ def test_auto_is_measured_with_the_engine_that_it_takes(tmp_path):
 
 def test_unknown_experiments_and_engines_are_errors():
     with pytest.raises(InputError, match="groups are bounce, boxes, collision"):
-        PhysicsBenchOptions(only=("jump",)).chosen()
+        chosen(("jump",))
     with pytest.raises(InputError, match="--engine warp"):
         PhysicsBenchOptions(engines=("warp",))

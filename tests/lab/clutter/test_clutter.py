@@ -20,7 +20,8 @@ from stages.lab.clutter import scenes
 from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.examples import Example, read_example
 from stages.lab.clutter.noise_model import Degradation, observed
-from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
+from stages.lab.clutter.options import ClutterOptions
+from stages.lab.clutter.scenes import Shelf, make_scene, run
 from stages.lab.training import segmenter_data, train_segmenter
 from stages.lab.training.segmenter_data import SCALE_RANGE, augmented, targets
 from tests.conftest import random_gaussians

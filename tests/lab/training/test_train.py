@@ -21,9 +21,10 @@ from stages.core.models.checkpoints import build, load
 from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import read_groups, write_motions
 from stages.lab.training.data import ClipSampler, train_validation_split
+from stages.lab.training.options import OPTIMIZERS, TrainOptions
 from stages.lab.training.rollout_loss import RolloutLoss
-from stages.lab.training.state import GRADIENT_CLIP, OPTIMIZERS, WARMUP_STEPS, TrainingState, _optimizer
-from stages.lab.training.train import TrainOptions, run, validate
+from stages.lab.training.state import GRADIENT_CLIP, WARMUP_STEPS, TrainingState, _optimizer
+from stages.lab.training.train import run, validate
 from stages.lab.training.widen import widen
 from tests.conftest import CliRunner
 from tests.lab.training.motions import DT, falling, without_last

@@ -14,15 +14,9 @@ from stages.core.geometry.cameras import depths
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.weights import load
 from stages.core.scene.scene_ply import write_scene
+from stages.lab.training.options import SplatterOptions
 from stages.lab.training.splatter_data import PosedViews, read_training_scenes, render_views
-from stages.lab.training.train_splatter import (
-    SplatterOptions,
-    held_out_psnr,
-    load_network,
-    run,
-    step_loss,
-    view_geometry,
-)
+from stages.lab.training.train_splatter import held_out_psnr, load_network, run, step_loss, view_geometry
 from tests.conftest import ring, two_balls_scene
 from tests.core.models.pi3.test_network import TINY, random_weights
 from tests.reconstruct.oracle import truth

@@ -10,6 +10,7 @@ from typer.models import OptionInfo
 from ngff_cli.options import AsJson, Device, Keypoints, Out, SceneCount, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
 from stages.lab.clutter.options import ClutterOptions
+from stages.lab.dataset.options import DatasetOptions, HeldoutOptions
 
 app = typer.Typer()
 
@@ -44,34 +45,36 @@ def dataset(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
     groups: Annotated[
         str, Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
-    ] = "3_0..3_9,4,6",
+    ] = DatasetOptions.groups,
     only: Annotated[
         str,
         Option(
             help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
             "objects, backgrounds, scene_configs"
         ),
-    ] = "motions",
-    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, Option(help="keypoints per object in motions")] = 2048,
-    dx: Dx = 0.02,
-    spacing: ParticleSpacing = 0.009,
-    substep: Substep = 1e-4,
+    ] = DatasetOptions.only,
+    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = DatasetOptions.frames,
+    keypoints: Annotated[int, Option(help="keypoints per object in motions")] = DatasetOptions.keypoints,
+    dx: Dx = DatasetOptions.dx,
+    spacing: ParticleSpacing = DatasetOptions.spacing,
+    substep: Substep = DatasetOptions.substep,
     nudge: Annotated[
         float, Option(help="shift of each object's initial position [m]; see `statistics --against`")
-    ] = 0.0,
+    ] = DatasetOptions.nudge,
     exact: Annotated[
         bool,
         Option(
             "--exact",
             help="bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic",
         ),
-    ] = False,
-    views: Annotated[str, Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
-    backgrounds: Annotated[str, Option(help="backgrounds of the videos: some of table0,...,table7, or all")] = "all",
-    resolution: Annotated[int, Option(help="side of the videos [px]")] = 448,
-    shard: Annotated[str, Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
-    limit: Annotated[int, Option(help="scenes of each group; 0: all")] = 0,
+    ] = DatasetOptions.exact,
+    views: Annotated[str, Option(help="views of the videos: some of 0,4,...,96, or all")] = DatasetOptions.views,
+    backgrounds: Annotated[
+        str, Option(help="backgrounds of the videos: some of table0,...,table7, or all")
+    ] = DatasetOptions.backgrounds,
+    resolution: Annotated[int, Option(help="side of the videos [px]")] = DatasetOptions.resolution,
+    shard: Annotated[str, Option(help="i/n: the i-th of n equal parts of the groups")] = DatasetOptions.shard,
+    limit: Annotated[int, Option(help="scenes of each group; 0: all")] = DatasetOptions.limit,
     check: Annotated[bool, Option("--check", help="only compare all files with their checksums")] = False,
     ray: Annotated[
         str,
@@ -80,11 +83,10 @@ def dataset(
             "FOLDER at the same path; each makes one group at a time"
         ),
     ] = "",
-    device: Device = "auto",
+    device: Device = DatasetOptions.device,
 ) -> None:
     """Generate GSCollision: scenes, their motion, and videos, in the published layout."""
     from stages.lab.dataset import generate, ray_cluster
-    from stages.lab.dataset.options import DatasetOptions
 
     options = DatasetOptions(
         groups=groups, only=only, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
@@ -118,7 +120,7 @@ def import_(
 def statistics(
     data: Annotated[Path, Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
     out: Out = None,
-    groups: Groups = "3_0..3_9,4,6",
+    groups: Groups = DatasetOptions.groups,
     keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 512,
     against: Annotated[
         Path | None, Option(help="the same scenes made with --nudge: report the predictability instead")
@@ -130,7 +132,7 @@ def statistics(
 ) -> None:
     """Statistics of a data set: falls, contacts, tipping and rest of the objects; or its predictability."""
     from stages.lab.dataset import scene_statistics, sensitivity
-    from stages.lab.dataset.scene_configs import parse_groups
+    from stages.lab.dataset.selection import parse_groups
 
     def lines(path: Path | None) -> list[str]:
         if against is not None:
@@ -193,30 +195,32 @@ def backgrounds(
 def heldout(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
     meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
-    scenes: SceneCount = 100,
-    objects: Annotated[int, Option(help="objects per scene")] = 3,
-    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Keypoints = 2048,
-    dx: Dx = 0.02,
-    spacing: ParticleSpacing = 0.009,
-    substep: Substep = 1e-4,
-    size: Annotated[float, Option(help="longest side of a mesh [m]")] = 0.5,
+    scenes: SceneCount = HeldoutOptions.scenes,
+    objects: Annotated[int, Option(help="objects per scene")] = HeldoutOptions.objects,
+    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = HeldoutOptions.frames,
+    keypoints: Keypoints = HeldoutOptions.keypoints,
+    dx: Dx = HeldoutOptions.dx,
+    spacing: ParticleSpacing = HeldoutOptions.spacing,
+    substep: Substep = HeldoutOptions.substep,
+    size: Annotated[float, Option(help="longest side of a mesh [m]")] = HeldoutOptions.size,
     shapes: Annotated[
         int,
         Option(
             help="number of random objects for training, written as the group varied (with --from made of its meshes: "
             "the group meshes); 0: none"
         ),
-    ] = 0,
-    solid: Annotated[bool, Option("--solid", help="fill the random objects: the group solid")] = False,
+    ] = HeldoutOptions.shapes,
+    solid: Annotated[bool, Option("--solid", help="fill the random objects: the group solid")] = HeldoutOptions.solid,
     rotations: Annotated[
         int, Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
-    ] = 0,
-    seed: Annotated[int, Option(help="of scenes and random objects; other than 0: ends the group's name", min=0)] = 0,
-    device: Device = "auto",
+    ] = HeldoutOptions.rotations,
+    seed: Annotated[
+        int, Option(help="of scenes and random objects; other than 0: ends the group's name", min=0)
+    ] = HeldoutOptions.seed,
+    device: Device = HeldoutOptions.device,
 ) -> None:
     """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
-    from stages.lab.dataset.heldout import HeldoutOptions, run
+    from stages.lab.dataset.heldout import run
 
     options = HeldoutOptions(
         scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,

@@ -12,9 +12,8 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets import backgrounds
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.shapes import box, to_gaussians
-from stages.lab.dataset.object_particles import Discretisation
-from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.scene_configs import SCENE_COUNTS
+from stages.lab.dataset.options import DatasetOptions, Discretisation
+from stages.lab.dataset.selection import SCENE_COUNTS
 
 OPTIONS = DatasetOptions(
     groups="3_9", only="scenes,mpm,initial,dynamic", frames=3, keypoints=64, dx=0.08, spacing=0.04, substep=2e-3,

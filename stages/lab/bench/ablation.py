@@ -22,7 +22,7 @@ from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.bench.motion_options import AblationBenchOptions
 from stages.lab.dataset.keypoint_motions import KeypointMotions, read_groups
-from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
+from stages.lab.dataset.selection import EXTRA_GROUPS, parse_groups
 from stages.lab.training.ablation import ABLATIONS, Ablation
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, train_validation_split
 from stages.lab.training.distributed import ProcessGroup

@@ -22,7 +22,8 @@ from stages.core.models.initial_conditions import InitialConditions
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, motions_folder
-from stages.lab.dataset.object_particles import Asset, Discretisation, load_assets
+from stages.lab.dataset.object_particles import Asset, load_assets
+from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 

@@ -6,7 +6,7 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
-from stages.lab.dataset.layout import ORBIT_VIEWS
+from stages.lab.dataset.selection import ORBIT_VIEWS
 
 ORBIT_CENTRE, ORBIT_RADIUS, ORBIT_ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [m], [deg]
 RELATIVE_FOCAL = 1.5  # focal length divided by the image width

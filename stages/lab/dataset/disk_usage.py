@@ -10,9 +10,9 @@ from plyfile import PlyData
 
 from stages.core.errors import InputError
 from stages.lab.assets.objects import OBJECTS
-from stages.lab.dataset.layout import ORBIT_VIEWS, Layout
+from stages.lab.dataset.layout import Layout
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.scene_configs import SCENE_COUNTS, object_count
+from stages.lab.dataset.selection import ORBIT_VIEWS, SCENE_COUNTS, object_count
 
 VIDEO_FIXED_CAMERA, VIDEO_MOVING_CAMERA, DEPTH_MAP = 0.02, 0.035, 1.2  # measured size [bytes/px]
 KEYPOINT_COMPRESSION = 0.55  # compressed size of keypoints divided by the raw size, measured

@@ -23,13 +23,8 @@ from stages.core.scene.scene import SceneObject
 from stages.lab.assets.heldout_shapes import ShapeKind, surface_and_interior_points, surface_points
 from stages.lab.assets.mesh_files import object_name
 from stages.lab.assets.shapes import single_threaded
-from stages.lab.dataset.object_particles import (
-    Asset,
-    Discretisation,
-    cached_points,
-    count_for_spacing,
-    particle_volumes,
-)
+from stages.lab.dataset.object_particles import Asset, cached_points, count_for_spacing, particle_volumes
+from stages.lab.dataset.options import Discretisation
 
 log = logging.getLogger(__name__)
 FIRST_MESH_ID, FIRST_ROTATED_ID, FIRST_RANDOM_MESH_ID = 100, 2000, 3000  # object ids

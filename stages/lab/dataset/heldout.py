@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -26,17 +26,10 @@ from stages.lab.assets.mesh_files import find_objects
 from stages.lab.assets.random_shapes import random_shapes
 from stages.lab.dataset import extra_objects, object_particles
 from stages.lab.dataset.keypoint_motions import KeypointMotionsWriter
-from stages.lab.dataset.object_particles import SUBSTEP, Asset, Discretisation, placement_extents
-from stages.lab.dataset.scene_configs import (
-    HELDOUT,
-    MESHES,
-    ROTATED,
-    SOLID,
-    VARIED,
-    SceneConfig,
-    sample_scene,
-    write_scene_configs,
-)
+from stages.lab.dataset.object_particles import Asset, placement_extents
+from stages.lab.dataset.options import HeldoutOptions
+from stages.lab.dataset.scene_configs import SceneConfig, sample_scene, write_scene_configs
+from stages.lab.dataset.selection import HELDOUT, MESHES, ROTATED, SOLID, VARIED
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
 # index, and seed, of the first scene
@@ -45,48 +38,7 @@ SCENES_PER_SEED = 100_000
 SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of random shapes
 
 
-@dataclass(frozen=True)
-class HeldoutOptions:
-    """Which objects and scenes to make, and the settings of their simulation."""
-
-    scenes: int = 100
-    objects: int = 3  # per scene
-    frames: int = 100
-    keypoints: int = 2048  # per object
-    dx: float = 0.02  # grid spacing [m]
-    spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # the longest; shorter for objects that are too stiff for it [s]
-    size: float = 0.5  # longest side of a mesh [m]
-    shapes: int = 0  # random shapes, or meshes of random size, and materials, instead of the eight
-    solid: bool = False  # fill the random shapes
-    rotations: int = 0  # random rotations of the ten objects, instead of the eight
-    seed: int = 0  # of scenes and random objects
-    device: str = "auto"
-
-    def __post_init__(self):
-        if self.scenes < 1 or not 1 <= self.objects <= 6:
-            raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
-        if not 0 <= self.shapes <= 1000:
-            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 random ones")
-        if not 0 <= self.rotations <= 1000:
-            raise InputError(f"--rotations {self.rotations}: 0 for the eight, or up to 1000 rotated objects")
-        if self.solid and not self.shapes or self.shapes and self.rotations:
-            raise InputError("--solid needs --shapes, and --rotations cannot be combined with them")
-        if not 0.1 <= self.size <= 1.0:
-            raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
-
-    def group(self, meshes: bool) -> str:
-        """Kind of the group of scenes, of meshes or not."""
-        random = MESHES if meshes else SOLID if self.solid else VARIED
-        return random if self.shapes else ROTATED if self.rotations else HELDOUT
-
-    @property
-    def discretisation(self) -> Discretisation:
-        """Grid spacing, particle spacing and longest substep of the simulation."""
-        return Discretisation(self.dx, self.spacing, self.substep)
-
-
-def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
+def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) -> str:
     """Write one group of scenes and return a one-line summary; an existing group is kept.
 
     `meshes` are files and folders. Raises InputError when they are combined with --solid or --rotations, or a mesh

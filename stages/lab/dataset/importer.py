@@ -32,7 +32,7 @@ from stages.core.scene.schema import reason
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.dataset.cameras import orbit_cameras
 from stages.lab.dataset.layout import Layout, object_kind
-from stages.lab.dataset.object_particles import FRAME_INTERVAL
+from stages.lab.dataset.options import FRAME_INTERVAL
 from stages.lab.dataset.scene_configs import read_scene_configs
 
 FILE_KIND = "a frame of GSCollision (.h5 with pos, cov3D and rot)"

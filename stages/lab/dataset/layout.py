@@ -1,4 +1,4 @@
-"""Folder layout of GSCollision, and parsers for the names of its parts.
+"""Folder layout of GSCollision.
 
 scene_configs/<group>.json                       start position of every object
 motions/<group>.h5                               keypoints in every frame (keypoint_motions.py); not published
@@ -17,15 +17,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.core.errors import InputError
 from stages.core.scene.files import replacing
-from stages.lab.assets.backgrounds import BACKGROUND_PLY, BACKGROUNDS
+from stages.lab.assets.backgrounds import BACKGROUND_PLY
 from stages.lab.assets.objects import OBJECTS, POINT_CLOUD, ObjectKind
 
-PARTS = ("scene_configs", "motions", "objects", "backgrounds", "scenes", "mpm", "initial", "dynamic")
 SCENE_PARTS = ("scenes", "mpm", "initial", "dynamic")  # those with files for each scene
-ORBIT_VIEWS = 100  # cameras around a scene, one frame each of an initial video
-VIDEO_VIEWS = tuple(range(0, ORBIT_VIEWS, 4))  # cameras of the dynamic videos
 
 
 @dataclass(frozen=True)
@@ -82,34 +78,6 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
-
-
-def parse_parts(text: str) -> tuple[str, ...]:
-    """Parse --only: "mpm, scenes" -> ("scenes", "mpm"), in the order in which parts are made; InputError if unknown."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = next((name for name in names if name not in PARTS), None)
-    if unknown is not None or not names:
-        raise InputError(f"--only {unknown or text!r}: choose from {', '.join(PARTS)}")
-    return tuple(p for p in PARTS if p in names)
-
-
-def parse_views(text: str) -> tuple[int, ...]:
-    """Parse --views: "0,16" -> (0, 16); "all" gives the 25 published views; InputError for other cameras."""
-    if text == "all":
-        return VIDEO_VIEWS
-    names = [name.strip() for name in text.split(",")]
-    if not all(name.isdigit() and int(name) in VIDEO_VIEWS for name in names):
-        raise InputError(f"--views {text}: multiples of 4 from 0 to {VIDEO_VIEWS[-1]}, separated by commas, or all")
-    return tuple(sorted({int(name) for name in names}))
-
-
-def parse_backgrounds(text: str) -> tuple[str, ...]:
-    """Parse --backgrounds: "table0,table3" -> ("table0", "table3"); "all" gives all eight; InputError if unknown."""
-    names = tuple(BACKGROUNDS) if text == "all" else tuple(name.strip() for name in text.split(","))
-    unknown = next((name for name in names if name not in BACKGROUNDS), None)
-    if unknown is not None:
-        raise InputError(f"--backgrounds {unknown}: choose from {', '.join(BACKGROUNDS)}, or all")
-    return tuple(dict.fromkeys(names))
 
 
 def object_kind(object_id: int) -> ObjectKind:

@@ -24,26 +24,12 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.npz import read_npz
 from stages.lab.assets.objects import OBJECTS, ObjectKind, make_object
 from stages.lab.assets.shapes import single_threaded
+from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import PlacementExtent
 
-FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # as published [s]
 POISSON_RATIO = 0.3  # of all objects, as published
 FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a coefficient of 1 or more
 PLACEMENT_POINTS = 2048  # first particles of an object, of which distances between objects are computed
-
-
-@dataclass(frozen=True)
-class Discretisation:
-    """Resolution of the simulation in space and time."""
-
-    dx: float = 0.02  # grid spacing [m]
-    spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # [s]; the longest, where stable_substep applies
-
-    @property
-    def substeps(self) -> int:
-        """Substeps per frame."""
-        return round(FRAME_INTERVAL / self.substep)
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,43 @@
-"""Options of `ngff-lab dataset`."""
+"""Options of `ngff-lab dataset` and `heldout`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
-from stages.lab.dataset.layout import PARTS, parse_backgrounds, parse_parts, parse_views
-from stages.lab.dataset.object_particles import SUBSTEP, Discretisation
-from stages.lab.dataset.scene_configs import parse_groups
+from stages.lab.dataset.selection import (
+    HELDOUT,
+    MESHES,
+    PARTS,
+    ROTATED,
+    SOLID,
+    VARIED,
+    parse_backgrounds,
+    parse_groups,
+    parse_parts,
+    parse_views,
+)
 
+FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # as published [s]
 PREREQUISITES = {  # parts that a part is generated from
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
 MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """Resolution of the simulation in space and time."""
+
+    dx: float = 0.02  # grid spacing [m]
+    spacing: float = 0.009  # between particles on a surface [m]
+    substep: float = SUBSTEP  # [s]; the longest, where stable_substep applies
+
+    @property
+    def substeps(self) -> int:
+        """Substeps per frame."""
+        return round(FRAME_INTERVAL / self.substep)
 
 
 @dataclass(frozen=True)
@@ -87,6 +111,47 @@ class DatasetOptions:
         """The settings common to all files of a data set, as stored in manifest.json."""
         shared = ("frames", "keypoints", "dx", "spacing", "substep", "nudge", "resolution")
         return {**{name: getattr(self, name) for name in shared}, "exact": self.deterministic}
+
+
+@dataclass(frozen=True)
+class HeldoutOptions:
+    """Which objects and scenes to make, and the settings of their simulation."""
+
+    scenes: int = 100
+    objects: int = 3  # per scene
+    frames: int = 100
+    keypoints: int = 2048  # per object
+    dx: float = 0.02  # grid spacing [m]
+    spacing: float = 0.009  # between particles on a surface [m]
+    substep: float = SUBSTEP  # the longest; shorter for objects that are too stiff for it [s]
+    size: float = 0.5  # longest side of a mesh [m]
+    shapes: int = 0  # random shapes, or meshes of random size, and materials, instead of the eight
+    solid: bool = False  # fill the random shapes
+    rotations: int = 0  # random rotations of the ten objects, instead of the eight
+    seed: int = 0  # of scenes and random objects
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.scenes < 1 or not 1 <= self.objects <= 6:
+            raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
+        if not 0 <= self.shapes <= 1000:
+            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 random ones")
+        if not 0 <= self.rotations <= 1000:
+            raise InputError(f"--rotations {self.rotations}: 0 for the eight, or up to 1000 rotated objects")
+        if self.solid and not self.shapes or self.shapes and self.rotations:
+            raise InputError("--solid needs --shapes, and --rotations cannot be combined with them")
+        if not 0.1 <= self.size <= 1.0:
+            raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
+
+    def group(self, meshes: bool) -> str:
+        """Kind of the group of scenes, of meshes or not."""
+        random = MESHES if meshes else SOLID if self.solid else VARIED
+        return random if self.shapes else ROTATED if self.rotations else HELDOUT
+
+    @property
+    def discretisation(self) -> Discretisation:
+        """Grid spacing, particle spacing and longest substep of the simulation."""
+        return Discretisation(self.dx, self.spacing, self.substep)
 
 
 def _parse_shard(text: str) -> tuple[int, int]:

@@ -17,12 +17,12 @@ from stages.core.scene.files import replacing
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
 from stages.lab.dataset.object_particles import (
     Asset,
-    Discretisation,
     count_for_spacing,
     load_assets,
     particle_volumes,
     placement_extents,
 )
+from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import perturbed, sample_group
 from stages.lab.dataset.simulation import SimulationSettings, simulate
 

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.schema import number, numbers, quote, read_json, reason, rows, whole
+from stages.lab.dataset.selection import MORE_GROUPS, SCENE_COUNTS, object_count
 
 SEED = 42
 HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
@@ -27,13 +28,7 @@ MIN_GAP = 0.05  # between points of two objects, and between their centres [m]
 MAX_OFFSET = 0.1  # horizontal, from the object placed before, in scenes of up to 4 objects [m]
 MAX_PLACEMENTS = 500  # attempts to place an object before its scene is drawn again
 MAX_DRAWS = 200  # of the objects of a scene
-HELDOUT = "heldout"  # group of scenes of eight other objects that are never trained on
-# groups of random shapes, solid random shapes, rotated objects, and objects made from meshes
-VARIED, SOLID, ROTATED, MESHES = "varied", "solid", "turned", "meshes"
-EXTRA_GROUPS = (VARIED, SOLID, ROTATED, MESHES)  # unpublished groups that may be trained on; also varied_1, ...
-MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of three objects, for training
 SCENE_NAME = re.compile(r"[\w-][\w.-]{0,199}")  # no separators, not hidden, not ".."
-SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # scenes in each group
 
 
 @dataclass(frozen=True)
@@ -85,30 +80,6 @@ def perturbed(configs: Mapping[str, SceneConfig], distance: float) -> dict[str, 
         offset = rng.normal(size=(len(c.ids), 3))
         moved = np.array(c.translation) + distance * offset / np.linalg.norm(offset, axis=1, keepdims=True)
         out[name] = replace(c, translation=tuple(tuple(p) for p in moved.tolist()))
-    return out
-
-
-def object_count(group: str) -> int:
-    """Number of objects in each scene of a group; raises InputError for an unknown group."""
-    if group not in SCENE_COUNTS:
-        raise InputError(f"--groups {group}: choose from {', '.join(SCENE_COUNTS)}")
-    return 3 if group in MORE_GROUPS else int(group.split("_")[0])
-
-
-def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
-    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are further names allowed, also with a number.
-
-    Raises InputError for an unknown group.
-    """
-    out: list[str] = []
-    for part in text.split(","):
-        span = re.fullmatch(r"(\w+)_(\d)\.\.\1_(\d)", part.strip())
-        names = [f"{span[1]}_{i}" for i in range(int(span[2]), int(span[3]) + 1)] if span else [part.strip()]
-        for name in names:
-            if re.sub(r"_\d+$", "", name) not in more:
-                object_count(name)
-            if name not in out:
-                out.append(name)
     return out
 
 

@@ -22,8 +22,8 @@ from stages.lab.dataset.gaussian_frames import (
     write_frames,
 )
 from stages.lab.dataset.layout import Layout, replacing_folder
-from stages.lab.dataset.object_particles import FRAME_INTERVAL, Asset
-from stages.lab.dataset.options import DatasetOptions
+from stages.lab.dataset.object_particles import Asset
+from stages.lab.dataset.options import FRAME_INTERVAL, DatasetOptions
 from stages.lab.dataset.scene_configs import SceneConfig
 from stages.lab.dataset.simulation import SimulationSettings, simulation_batches, valid_scenes
 from stages.lab.dataset.videos import write_dynamic, write_initial

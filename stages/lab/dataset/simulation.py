@@ -20,15 +20,8 @@ from stages.core.models.initial_conditions import BOX, GRAVITY
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.batch import Batch
 from stages.lab.dataset.keypoint_motions import KeypointMotions
-from stages.lab.dataset.object_particles import (
-    FRAME_INTERVAL,
-    FRICTION,
-    POISSON_RATIO,
-    SUBSTEP,
-    Asset,
-    Discretisation,
-    translated,
-)
+from stages.lab.dataset.object_particles import FRICTION, POISSON_RATIO, Asset, translated
+from stages.lab.dataset.options import FRAME_INTERVAL, SUBSTEP, Discretisation
 from stages.lab.dataset.scene_configs import SceneConfig
 
 log = logging.getLogger(__name__)

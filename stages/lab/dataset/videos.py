@@ -31,9 +31,10 @@ from stages.core.scene.images import VideoWriter
 from stages.lab.assets.splat_files import camera_rows
 from stages.lab.dataset.cameras import orbit_cameras
 from stages.lab.dataset.gaussian_frames import SkinnedScene
-from stages.lab.dataset.layout import ORBIT_VIEWS, object_kind
-from stages.lab.dataset.object_particles import FRAME_INTERVAL
+from stages.lab.dataset.layout import object_kind
+from stages.lab.dataset.options import FRAME_INTERVAL
 from stages.lab.dataset.scene_configs import SceneConfig
+from stages.lab.dataset.selection import ORBIT_VIEWS
 from stages.render.background import RenderBackground
 from stages.render.draw import render_view
 

@@ -21,7 +21,7 @@ from stages.core.models.checkpoints import build, load, save
 from stages.core.scene.files import ngff_version
 from stages.evaluate.dynamics import all_metrics
 from stages.lab.dataset.keypoint_motions import KeypointMotions, read_groups
-from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
+from stages.lab.dataset.selection import EXTRA_GROUPS, parse_groups
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, describe_groups, train_validation_split
 from stages.lab.training.distributed import ProcessGroup, process_group
 from stages.lab.training.history import curve_columns, runs_of

@@ -22,19 +22,18 @@ from stages.lab.dataset.keypoint_motions import (
     read_motions,
     write_motions,
 )
-from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
-from stages.lab.dataset.options import DatasetOptions
+from stages.lab.dataset.object_particles import Asset, particle_volumes
+from stages.lab.dataset.options import DatasetOptions, Discretisation
 from stages.lab.dataset.scene_configs import (
     HALF_EXTENT,
-    SCENE_COUNTS,
     SceneConfig,
-    parse_groups,
     perturbed,
     read_scene_configs,
     sample_group,
     sample_scene,
     write_scene_configs,
 )
+from stages.lab.dataset.selection import SCENE_COUNTS, parse_groups
 from stages.lab.dataset.simulation import SimulationSettings, simulate, simulation_batches, stable_substep
 from tests.lab.assets.test_objects import full_size
 from tests.lab.small_world import COARSE, box_shell

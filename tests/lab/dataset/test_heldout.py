@@ -15,10 +15,12 @@ from stages.lab.assets.random_shapes import random_shapes
 from stages.lab.assets.signed_distance import ellipsoid
 from stages.lab.dataset import extra_objects, object_particles
 from stages.lab.dataset.extra_objects import load_shape_assets, random_mesh_assets, rotated_assets
-from stages.lab.dataset.heldout import HeldoutOptions, run, sample_configs
+from stages.lab.dataset.heldout import run, sample_configs
 from stages.lab.dataset.keypoint_motions import read_motions
-from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
-from stages.lab.dataset.scene_configs import EXTRA_GROUPS, HELDOUT, parse_groups, read_scene_configs
+from stages.lab.dataset.object_particles import Asset, particle_volumes
+from stages.lab.dataset.options import Discretisation, HeldoutOptions
+from stages.lab.dataset.scene_configs import read_scene_configs
+from stages.lab.dataset.selection import EXTRA_GROUPS, HELDOUT, parse_groups
 from tests.conftest import CliRunner
 
 DISCRETISATION = Discretisation(dx=0.1, spacing=0.06, substep=5e-4)

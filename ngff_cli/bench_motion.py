@@ -27,7 +27,7 @@ Workers = Annotated[int, Option(help="processes")]
 def bench_physics(
     out: OutWithTable = Path("physics.json"),
     only: Annotated[
-        list[str], Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
+        str, Option(help="experiments by group or pattern, such as slide,'boxes/0.3m*'; default: all")
     ] = PhysicsBenchOptions.only,
     engine: Annotated[list[str], Option(help="auto | rigid | mpm | ngff; repeatable")] = PhysicsBenchOptions.engines,
     quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = PhysicsBenchOptions.quality,
@@ -45,7 +45,7 @@ def bench_physics(
     from stages.lab.bench.physics import run
 
     options = PhysicsBenchOptions(
-        only=tuple(only), engines=tuple(engine), quality=quality, keypoints=keypoints, weights=weights,
+        only=only, engines=tuple(engine), quality=quality, keypoints=keypoints, weights=weights,
         contact=contact, device=device,
     )  # fmt: skip
     print_results(lambda path: run(path, options), out, as_json)
@@ -143,7 +143,7 @@ def bench_track(
 def bench_fit(
     scenes: SceneCount = FitBenchOptions.scenes,
     only: Annotated[
-        str, Option(help="slide | bounce | collision | soft; default: all four, alternating")
+        str, Option(help="some of slide,bounce,collision,soft, alternating; default: all four")
     ] = FitBenchOptions.only,
     truth: Annotated[str, Option(help="engine of the motions; default: that which fits them")] = FitBenchOptions.truth,
     noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = FitBenchOptions.noise,
@@ -168,8 +168,8 @@ def bench_fit(
 @app.command("fit-films")
 def bench_fit_films(
     scenes: SceneCount = FilmBenchOptions.scenes,
-    only: Annotated[str, Option(help="slide | throw; default: both, alternating")] = FilmBenchOptions.only,
-    cameras: Annotated[int, Option(help="films per scene")] = FilmBenchOptions.cameras,
+    only: Annotated[str, Option(help="slide or throw; default: both, alternating")] = FilmBenchOptions.only,
+    films: Annotated[int, Option(help="films per scene")] = FilmBenchOptions.films,
     width: Annotated[int, Option(help="width of the films [px]")] = FilmBenchOptions.width,
     frames: Annotated[int, Option(help="frames of each film")] = FilmBenchOptions.frames,
     workers: Workers = FilmBenchOptions.workers,
@@ -182,6 +182,6 @@ def bench_fit_films(
     from stages.lab.bench.fit_films import run
 
     options = FilmBenchOptions(
-        scenes=scenes, only=only, cameras=cameras, width=width, frames=frames, workers=workers, seed=seed, device=device
+        scenes=scenes, only=only, films=films, width=width, frames=frames, workers=workers, seed=seed, device=device
     )
     print_results(lambda path: run(path, options), out, as_json)

@@ -36,15 +36,17 @@ def bench_reconstruct(
     matcher: Annotated[
         str, Option(help="features matched between photos: sift | aliked-lightglue")
     ] = ReconstructBenchOptions.matcher,
-    cameras: Annotated[
-        bool, Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
-    ] = ReconstructBenchOptions.cameras,
+    cameras_only: Annotated[
+        bool, Option("--cameras-only", help="stop after the cameras are estimated, to compare matchers")
+    ] = ReconstructBenchOptions.cameras_only,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
     from stages.lab.bench.reconstruct import run
 
-    options = ReconstructBenchOptions(quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras)
+    options = ReconstructBenchOptions(
+        quality=quality, holdout=holdout, device=device, matcher=matcher, cameras_only=cameras_only
+    )
     print_results(lambda path: run(sets, path, options), out, as_json)
 
 
@@ -70,20 +72,21 @@ def bench_appearance(
 def bench_segment(
     sets: Annotated[
         list[Path] | None,
-        Argument(metavar="PHOTOSET...", show_default=False, help="with --photos: folders of photos, or with images/"),
+        Argument(
+            metavar="[PHOTOSET...]",
+            show_default=False,
+            help="folders of photos, or with images/, that have label images; default: synthetic scenes",
+        ),
     ] = None,
-    photos: Annotated[
-        bool, Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
-    ] = False,
     labels: Annotated[
         Path | None,
         Option(
-            help="with --photos: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
+            help="of photo sets: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
         ),
     ] = SegmentPhotosOptions.labels,
     labelled: Annotated[
         Path | None,
-        Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"),
+        Option(help="of photo sets: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"),
     ] = SegmentPhotosOptions.labelled,
     scenes: Annotated[
         int, Option(help="scenes of each kind: separate objects, and objects in contact")
@@ -102,11 +105,11 @@ def bench_segment(
 ) -> None:
     """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
 
-    With --photos: objects in real photos against label images: recall, IoU and panoptic quality.
+    Of photo sets: objects in real photos against label images: recall, IoU and panoptic quality.
     """
-    if not photos:
-        if sets or labels or labelled:
-            raise InputError("PHOTOSET, --labels and --labelled: only apply to real photos; add --photos")
+    if not sets:
+        if labels or labelled:
+            raise InputError("--labels and --labelled: only apply to real photos; name their folders (PHOTOSET)")
         from stages.lab.bench.segment import run
 
         options = SegmentBenchOptions(
@@ -117,7 +120,7 @@ def bench_segment(
     from stages.lab.bench.segment_photos import run as run_photos
 
     chosen = SegmentPhotosOptions(labels=labels, labelled=labelled, device=device)
-    print_results(lambda path: run_photos(sets or [], path, chosen), out, as_json)
+    print_results(lambda path: run_photos(sets, path, chosen), out, as_json)
 
 
 @app.command("segment-ablation")
@@ -129,7 +132,7 @@ def bench_segment_ablation(
     scores: Annotated[list[Path], Option(help="other scenes, for the scores of candidates; repeatable")],
     judge: Annotated[list[Path], Option(help="reconstructed scenes to judge on; repeatable")],
     out: OutWithTable = Path("segment_ablation.json"),
-    only: Annotated[list[str], Option(help="name of an ablation, such as colour; repeatable; default: all")] = [],  # noqa: B006
+    only: Annotated[str, Option(help="names of the ablations, such as full,colour; default: all")] = "",
     steps: Annotated[int, Option(help="training steps of each network")] = SegmentAblationOptions.steps,
     batch: Annotated[int, Option(help="crops per step")] = SegmentAblationOptions.batch,
     workers: Annotated[

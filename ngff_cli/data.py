@@ -32,12 +32,12 @@ def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
 @app.command()
 def example(
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
-    photos: Annotated[int, Option(help="number of photos")] = 26,
+    views: Annotated[int, Option(help="number of photos")] = 26,
 ) -> None:
     """Generate the example: rendered photos of toys on a table, with true cameras, labels and motion."""
     from stages.lab.assets.example import make_example
 
-    make_example(out, photos)
+    make_example(out, views)
 
 
 @app.command()
@@ -46,13 +46,13 @@ def dataset(
     groups: Annotated[
         str, Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
     ] = DatasetOptions.groups,
-    only: Annotated[
+    parts: Annotated[
         str,
         Option(
-            help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
+            help="what to generate, separated by commas: motions, scenes, mpm, initial, dynamic, "
             "objects, backgrounds, scene_configs"
         ),
-    ] = DatasetOptions.only,
+    ] = DatasetOptions.parts,
     frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = DatasetOptions.frames,
     keypoints: Annotated[int, Option(help="keypoints per object in motions")] = DatasetOptions.keypoints,
     dx: Dx = DatasetOptions.dx,
@@ -89,7 +89,7 @@ def dataset(
     from stages.lab.dataset import generate, ray_cluster
 
     options = DatasetOptions(
-        groups=groups, only=only, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
+        groups=groups, parts=parts, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
         nudge=nudge, exact=exact, views=views, backgrounds=backgrounds, resolution=resolution, shard=shard,
         limit=limit, device=device,
     )  # fmt: skip
@@ -235,7 +235,7 @@ def clutter(
     meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
     count: SceneCount = ClutterOptions.count,
     first: Annotated[int, Option(help="number of the first scene")] = ClutterOptions.first,
-    photos: Annotated[int, Option(help="photos of each scene")] = ClutterOptions.photos,
+    views: Annotated[int, Option(help="photos of each scene")] = ClutterOptions.views,
     size: Annotated[int, Option(help="longest side of a photo [px]")] = ClutterOptions.size,
     observations: Annotated[
         int,
@@ -263,7 +263,7 @@ def clutter(
     from stages.lab.clutter.scenes import run
 
     options = ClutterOptions(
-        count=count, first=first, photos=photos, size=size, observations=observations, reconstruct=reconstruct,
+        count=count, first=first, views=views, size=size, observations=observations, reconstruct=reconstruct,
         exact=exact, seed=seed, device=device,
     )  # fmt: skip
     for line in run(out, options, meshes):

@@ -16,7 +16,7 @@ from stages.lab.dataset.options import DatasetOptions, Discretisation
 from stages.lab.dataset.selection import SCENE_COUNTS
 
 OPTIONS = DatasetOptions(
-    groups="3_9", only="scenes,mpm,initial,dynamic", frames=3, keypoints=64, dx=0.08, spacing=0.04, substep=2e-3,
+    groups="3_9", parts="scenes,mpm,initial,dynamic", frames=3, keypoints=64, dx=0.08, spacing=0.04, substep=2e-3,
     exact=True, views="0,16", backgrounds="table0", resolution=32,
 )  # fmt: skip
 COARSE = Discretisation(dx=0.08, spacing=0.03, substep=5e-4)

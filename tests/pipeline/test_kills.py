@@ -46,7 +46,7 @@ COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after 
     "evaluate": "evaluate traj.h5 --against traj.h5 -o out/metrics.json",
     "train": "train gcn --data data -o out/w.safetensors --steps 12 --batch 2 --keypoints 8 --horizons 2,3 --width 8 "
              "--groups 3_0..3_1",
-    "dataset": "dataset out --groups 3_9 --only scenes,motions --frames 3 --keypoints 64 --dx .08 --spacing .04 "
+    "dataset": "dataset out --groups 3_9 --parts scenes,motions --frames 3 --keypoints 64 --dx .08 --spacing .04 "
                "--substep 2e-3 --exact",
 }  # fmt: skip
 RESUMED = {"reconstruct": ".steps-scene.ply", "train": "w.ckpt"}  # where there is such a file

@@ -16,6 +16,7 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.lab.assets import background_paint as paint
 from stages.lab.assets.paint import box2
 from stages.lab.assets.shapes import Surface, noise, single_threaded, to_gaussians
+from stages.lab.names import chosen_names
 
 TABLE_HEIGHT, FLOOR_HEIGHT, CEILING_HEIGHT = -0.94, -2.5, 1.7  # heights [m]
 TABLE_HALF_WIDTH, ROOM_HALF_WIDTH = 2.1, 6.6  # half widths of the table and of the room [m]; cameras orbit at 3.8
@@ -202,7 +203,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
     from stages.render.overlay import tile_images
 
     images = []
-    names = [_known(name.strip()) for name in only.split(",") if name.strip()] or list(BACKGROUNDS)
+    names = chosen_names(only, BACKGROUNDS)
     for name in tqdm(names, desc="backgrounds", unit="background"):
         g = make_background(name)
         folder = Path(out) / name

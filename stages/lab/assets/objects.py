@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from stages.core.backends import choose
 from stages.core.errors import InputError
+from stages.lab.names import chosen_names
 
 if TYPE_CHECKING:
     from stages.core.scene.gaussians import Gaussians
@@ -63,14 +64,6 @@ class ObjectsOptions:
     up: str = "auto"  # axis of a mesh that points up
     light: bool = True  # bake soft light into the colours of a mesh
 
-    @property
-    def names(self) -> list[str]:
-        """The chosen objects; raises InputError for unknown names."""
-        names = [name.strip() for name in self.only.split(",") if name.strip()] or list(OBJECTS)
-        for name in names:
-            _known(name)
-        return names
-
 
 def make_object(name: str) -> Gaussians:
     """An object by name: SH degree 2, object_id 1, bounding box centred on the origin, scale prior not applied.
@@ -115,7 +108,8 @@ def run(
             raise InputError(f"--from: {sources[name][0]} and {files[0]} would both be written to {out / name}; rename "
                              "one of them or its folder")  # fmt: skip
         sources[name] = files
-    for name, files in tqdm((sources or dict.fromkeys(options.names, ())).items(), desc="objects", unit="object"):
+    sources = sources or dict.fromkeys(chosen_names(options.only, OBJECTS), ())
+    for name, files in tqdm(sources.items(), desc="objects", unit="object"):
         g = _from_mesh(files, options) if files else make_object(name)
         made_by = provenance("objects", list(files), options) if files else provenance("objects", [])
         write_object(out / name, g, name, made_by)  # the file does not depend on the other objects

@@ -23,6 +23,7 @@ from stages.lab.bench import common as bench
 from stages.lab.bench.motion_options import AblationBenchOptions
 from stages.lab.dataset.keypoint_motions import KeypointMotions, read_groups
 from stages.lab.dataset.selection import EXTRA_GROUPS, parse_groups
+from stages.lab.names import chosen_names
 from stages.lab.training.ablation import ABLATIONS, Ablation
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, train_validation_split
 from stages.lab.training.distributed import ProcessGroup
@@ -37,10 +38,7 @@ VALIDATION_CHECKS = 6  # validations in one training; the best weights are score
 
 def run(data: Path, out: Path, options: AblationBenchOptions, only: str = "") -> Iterator[str]:
     """Train each ablation, or those named in `only` (separated by commas); yield a line about each."""
-    names = [name.strip() for name in only.split(",")] if only else list(ABLATIONS)
-    unknown = [name for name in names if name not in ABLATIONS]
-    if unknown:
-        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(ABLATIONS)}")
+    names = chosen_names(only, ABLATIONS)
     base, device = _training(options), pick_device(options.device)
     asked = {k: v for k, v in asdict(options).items() if k != "device"}
     facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}

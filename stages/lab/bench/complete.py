@@ -28,10 +28,11 @@ from stages.evaluate import trajectories
 from stages.evaluate.images import psnr
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.scenes import chamfer, nearest_neighbours
-from stages.lab.assets.objects import ObjectsOptions, make_object
+from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import sheet, to_gaussians
 from stages.lab.bench import common as bench
 from stages.lab.bench.scene_options import CompleteBenchOptions
+from stages.lab.names import chosen_names
 from stages.refine.library import transformed
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
@@ -49,7 +50,7 @@ METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
 def true_scene(object_names: str, options: CompleteBenchOptions) -> Scene:
     """The objects side by side, rotated at random about the vertical, on a grey table whose top is z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
-    names = ObjectsOptions(object_names).names
+    names = chosen_names(object_names, OBJECTS, "--scene")
     table = sheet(1.6, 1.6, 0.012)
     parts = [to_gaussians(table, torch.full((len(table.points), 3), 0.55), 0, 0.9)]
     for i, name in enumerate(names):
@@ -166,7 +167,7 @@ def _line(scene: str, completer: str, row: dict[str, float]) -> str:
 
 def _library(folder: Path, options: CompleteBenchOptions) -> None:
     folder.mkdir()
-    for name in ObjectsOptions(options.known).names:
+    for name in chosen_names(options.known, OBJECTS, "--known"):
         write_scene(folder / f"{name}.ply", Scene(make_object(name)))
 
 

@@ -25,6 +25,7 @@ from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, as_json, fitted
 from stages.lab.fit.problem import pose_problem
+from stages.lab.names import chosen_names
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 KEYPOINTS, STEPS = 32, 50
@@ -127,7 +128,7 @@ def errors_of(fit: Fit, case: FitCase) -> list[dict]:
 def run(out: Path | None, options: FitBenchOptions) -> Iterator[str]:
     """Lines of a table of all scenes, and JSON in `out`."""
     device, results = pick_device(options.device), {}
-    kinds = [options.only] if options.only else FIT_KINDS
+    kinds = chosen_names(options.only, FIT_KINDS)
     yield f"{'scene':<14} identifiable: error +- half width of its interval"
     for index in range(options.scenes):
         case = fit_case(index, kinds[index % len(kinds)], options.seed)

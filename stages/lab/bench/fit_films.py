@@ -29,6 +29,7 @@ from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.fit import Fit, solve
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, as_json
+from stages.lab.names import chosen_names
 from stages.lab.track.stand_in import cameras_around, thinned
 from stages.render.options import RenderOptions
 from stages.render.stage import run as render
@@ -82,7 +83,7 @@ def film(toy: FilmedToy, frames: int, folder: Path) -> tuple[Path, list[Path]]:
 
 def measure(kind: str, options: FilmBenchOptions, seed: int) -> dict:
     """Errors of the parameters, from the films and from the motion that was followed through them alone."""
-    toy = filmed_toy(kind, options.cameras, options.width, seed)
+    toy = filmed_toy(kind, options.films, options.width, seed)
     with tempfile.TemporaryDirectory() as folder:
         scene, films = film(toy, options.frames, Path(folder))
         fit_options = MaterialFitOptions(engine="rigid", workers=options.workers, device=options.device)
@@ -103,13 +104,13 @@ def errors(fit: Fit, toy: FilmedToy) -> list[dict]:
 def run(out: Path | None, options: FilmBenchOptions) -> Iterator[str]:
     """Lines of a table of all scenes, and JSON in `out`."""
     device, results = pick_device(options.device), {}
-    kinds = [options.only] if options.only else FILM_KINDS
+    kinds = chosen_names(options.only, FILM_KINDS)
     for seed in range(options.seed, options.seed + options.scenes):
         kind = kinds[(seed - options.seed) % len(kinds)]
         results[f"{kind} {seed}"] = row = measure(kind, options, seed)
         yield f"{kind} {seed}: {_shown(row['rows'])}; {row['motions']} motions, {row['seconds']:.0f} s"
         yield f"    of the track: {_shown(row['of_the_track'])}"
-        write_results(out, "fit-films", device, {"cameras": options.cameras, "width": options.width, "scenes": results})
+        write_results(out, "fit-films", device, {"films": options.films, "width": options.width, "scenes": results})
 
 
 def _shown(rows: list[dict]) -> str:

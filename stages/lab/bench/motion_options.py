@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.lab.names import chosen_names
 from stages.reconstruct.options import QUALITY_PRESETS
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
@@ -15,7 +16,7 @@ FILM_KINDS = ("slide", "throw")
 class PhysicsBenchOptions:
     """What is measured, with which engines."""
 
-    only: tuple[str, ...] = ()  # patterns of names, such as "slide*"; empty: all
+    only: str = ""  # groups or patterns of names, such as "slide,tower/3*"; empty: all
     engines: tuple[str, ...] = ("rigid", "mpm", "ngff")
     quality: str = "draft"  # of MPM
     keypoints: int = 256
@@ -84,7 +85,7 @@ class FitBenchOptions:
     """Scenes, and how each is fitted."""
 
     scenes: int = 20  # of the kinds in turn
-    only: str = ""  # one of FIT_KINDS; empty: all
+    only: str = ""  # some of FIT_KINDS, separated by commas; empty: all
     truth: str = ""  # engine of the motions; empty: that which fits them
     noise: float = 0.002  # of the track [m]
     evaluations: int = 1500
@@ -94,8 +95,7 @@ class FitBenchOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        if self.only and self.only not in FIT_KINDS:
-            raise InputError(f"--only {self.only}: choose from {', '.join(FIT_KINDS)}")
+        chosen_names(self.only, FIT_KINDS)
         if self.truth and self.truth not in ENGINES:
             raise InputError(f"--truth {self.truth}: choose from {', '.join(ENGINES)}")
 
@@ -105,8 +105,8 @@ class FilmBenchOptions:
     """What is filmed, and how it is fitted."""
 
     scenes: int = 6  # of the kinds in turn
-    only: str = ""  # one of FILM_KINDS; empty: both
-    cameras: int = 2
+    only: str = ""  # some of FILM_KINDS; empty: both
+    films: int = 2  # of each scene
     width: int = 320  # of the films [px]
     frames: int = 25
     workers: int = 2
@@ -114,10 +114,9 @@ class FilmBenchOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        if self.only and self.only not in FILM_KINDS:
-            raise InputError(f"--only {self.only}: choose from {', '.join(FILM_KINDS)}")
-        if not (1 <= self.cameras <= 16 and 64 <= self.width <= 4096 and self.frames >= 3 and self.scenes >= 1):
-            raise InputError("--cameras must be 1 to 16, --width 64 to 4096, --frames 3 or more, --scenes 1 or more")
+        chosen_names(self.only, FILM_KINDS)
+        if not (1 <= self.films <= 16 and 64 <= self.width <= 4096 and self.frames >= 3 and self.scenes >= 1):
+            raise InputError("--films must be 1 to 16, --width 64 to 4096, --frames 3 or more, --scenes 1 or more")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import json
 import logging
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from fnmatch import fnmatch
 from pathlib import Path
@@ -29,9 +29,9 @@ from stages.simulate.stage import run as simulate
 FAILED = "failed"  # in place of a value, where the engine ended with an error
 
 
-def chosen(patterns: Sequence[str]) -> list[Experiment]:
-    """The experiments whose name fits one of the patterns, or all. Raises InputError where a pattern fits none."""
-    table = experiments()
+def chosen(only: str) -> list[Experiment]:
+    """The experiments that --only lists, or all. Raises InputError where a pattern fits none."""
+    table, patterns = experiments(), [pattern.strip() for pattern in only.split(",") if pattern.strip()]
     for pattern in patterns:
         if not any(_fits(name, pattern) for name in table):
             groups = ", ".join(sorted({name.partition("/")[0] for name in table}))

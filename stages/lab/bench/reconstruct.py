@@ -90,7 +90,7 @@ def photo_folder(folder: Path) -> Path:
 
 def measure(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
     """Reconstruct one set and compare it with its ground truth."""
-    facts, found, floor = (_cameras if options.cameras else _scene)(images, options)
+    facts, found, floor = (_cameras if options.cameras_only else _scene)(images, options)
     device = pick_device(options.device)
     row = {**facts, "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
     if (folder / "cameras.json").exists():

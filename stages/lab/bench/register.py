@@ -27,9 +27,10 @@ from stages.core.geometry.rotations import matrix, multiply, nearest_rotation, q
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
-from stages.lab.assets.objects import ObjectsOptions, make_object
+from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.bench import common as bench
 from stages.lab.bench.scene_options import RegisterBenchOptions
+from stages.lab.names import chosen_names
 from stages.refine.registration import register
 from stages.refine.registration_cloud import cloud_colours, diameter
 
@@ -179,7 +180,7 @@ if find_spec("splatreg"):
 
 def run(out: Path | None, options: RegisterBenchOptions) -> Iterator[str]:
     """Register the same parts with every method; yield a line for each object. All trials go to `out` as JSON."""
-    names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
+    names, compared, device = chosen_names(options.only, OBJECTS), METHODS, pick_device(options.device)
     yield f"{'correct of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
     rows = []
     for name in names:

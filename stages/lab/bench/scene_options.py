@@ -17,12 +17,12 @@ class ReconstructBenchOptions:
     holdout: int = 8
     device: str = "auto"
     matcher: str = "sift"
-    cameras: bool = False  # stop after the cameras, to compare matchers
+    cameras_only: bool = False  # stop after the cameras, to compare matchers
 
     def key(self, folder: Path) -> str:
         """Name of a set's row in the results."""
         matcher = "" if self.matcher == "sift" else f", {self.matcher}"
-        cameras = ", cameras" if self.cameras else ""
+        cameras = ", cameras" if self.cameras_only else ""
         return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
 
 

@@ -27,6 +27,7 @@ from stages.lab.bench import common as bench
 from stages.lab.bench.scene_options import SegmentAblationData, SegmentAblationOptions
 from stages.lab.clutter.examples import Example, read_example
 from stages.lab.clutter.scenes import EXACT, OBSERVED, RECONSTRUCTED
+from stages.lab.names import chosen_names
 from stages.lab.training.distributed import ProcessGroup
 from stages.lab.training.options import SegmenterTraining
 from stages.lab.training.segmenter_data import Targets, find_examples
@@ -89,16 +90,12 @@ ABLATIONS = {
 }  # fmt: skip
 
 
-def run(
-    data: SegmentAblationData,
-    out: Path,
-    options: SegmentAblationOptions,
-    only: Sequence[str] = (),
-) -> Iterator[str]:
-    """Train each ablation, or those named in `only`; yields a line about each. OUT is JSON, with a table beside it."""
-    names = list(only) or list(ABLATIONS)
-    if unknown := [name for name in names if name not in ABLATIONS]:
-        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(ABLATIONS)}")
+def run(data: SegmentAblationData, out: Path, options: SegmentAblationOptions, only: str = "") -> Iterator[str]:
+    """Train each ablation, or those named in `only` (separated by commas); yields a line about each.
+
+    OUT is JSON, with a table beside it.
+    """
+    names = chosen_names(only, ABLATIONS)
     device = pick_device(options.device)
     facts = {"options": asdict(options), "machine": bench.machine(device), "rows": {}}
     for name in names:

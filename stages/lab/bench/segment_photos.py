@@ -39,8 +39,6 @@ def run(sets: list[Path], out: Path | None, options: SegmentPhotosOptions) -> It
 
     The row of a set that cannot be reconstructed holds the error message.
     """
-    if not sets:
-        raise InputError("--photos: name one or more photo sets, folders of photos or with images/")
     folders = {folder.resolve().name: (photo_folder(folder), labels_of(folder, options)) for folder in map(Path, sets)}
     device = pick_device(options.device)
     yield bench.machine(device)
@@ -49,7 +47,7 @@ def run(sets: list[Path], out: Path | None, options: SegmentPhotosOptions) -> It
     for name, (photos, labels) in folders.items():
         facts["sets"][name] = measure(name, photos, labels, options)
         yield _text_row(_cells(name, facts["sets"][name]))
-        bench.write_results(out, "segment --photos", device, facts)
+        bench.write_results(out, "segment PHOTOSET...", device, facts)
     if out is not None:
         with replacing(Path(out).with_suffix(".md")) as part:
             part.write_text("\n".join(markdown(facts, bench.machine(device))) + "\n")
@@ -131,9 +129,9 @@ def markdown(facts: dict, machine: str) -> Iterator[str]:
     yield "# Segmentation of real photos"
     yield ""
     yield (
-        f"`ngff-lab bench segment --photos`, {machine}. Each set reconstructed and segmented with default options and "
-        "compared with hand-made label images (definitions: `stages/evaluate/README.md`). PQ by labels: the same scene "
-        "labelled by a vote of these label images."
+        f"`ngff-lab bench segment PHOTOSET...`, {machine}. Each set reconstructed and segmented with default options "
+        "and compared with hand-made label images (definitions: `stages/evaluate/README.md`). PQ by labels: the same "
+        "scene labelled by a vote of these label images."
     )
     yield ""
     yield f"| {' | '.join(HEADINGS)} |"

@@ -290,7 +290,7 @@ def _cameras(furniture: Furniture, points: Float[Tensor, "n 3"], rng: Rng, optio
         sweep = min(math.radians(rng.uniform(60, 140)), stop - start)
         start = rng.uniform(start, stop - sweep)
         stop = start + sweep
-    n = options.photos
+    n = options.views
     t = np.linspace(0, 1, n, endpoint=not orbit)
     shake = rng.uniform(0.0, 0.12)
     azimuth = start + t * (stop - start) + shake * 0.3 * rng.normal(size=n)

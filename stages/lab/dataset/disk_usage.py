@@ -61,7 +61,7 @@ def missing_bytes(layout: Layout, options: DatasetOptions) -> dict[str, float]:
     views, backgrounds = len(options.view_indices), len(options.background_names)
     out = {}
     for part in ("scene_configs", "motions", "scenes", "mpm", "initial", "dynamic"):
-        if part not in options.parts:
+        if part not in options.needed_parts:
             continue
         out[part] = 0.0
         for group in options.shard_groups:
@@ -94,7 +94,7 @@ def require_disk_space(root: Path, parts: dict[str, float]) -> None:
     print(f"{root}: about {format_bytes(total)} to write ({missing}), {format_bytes(free)} free", flush=True)
     if total > MAX_DISK_FRACTION * free:
         raise InputError(f"{root}: about {format_bytes(total)} are needed but {format_bytes(free)} are free; choose "
-                         "fewer parts (--only), --groups, --views or --backgrounds, or a larger disk")  # fmt: skip
+                         "fewer --parts, --groups, --views or --backgrounds, or a larger disk")  # fmt: skip
 
 
 def format_bytes(size: float) -> str:

@@ -76,13 +76,13 @@ class DatasetGenerator:
         """Particles, skins and backgrounds of the scene files."""
         from stages.lab.dataset.scene_files import SceneAssets
 
-        names = self.options.background_names if "backgrounds" in self.options.parts else ()
+        names = self.options.background_names if "backgrounds" in self.options.needed_parts else ()
         tables = {n: read_scene(self.layout.background(n)).gaussians.to(self.device) for n in names}
         return SceneAssets(self.assets, load_skins(self.layout, self.assets), tables)
 
     def make_shared(self) -> None:
         """Write missing objects and backgrounds."""
-        layout, parts = self.layout, self.options.parts
+        layout, parts = self.layout, self.options.needed_parts
         folders = [layout.root / name for name in ("objects", "backgrounds")]
         _remove_partial(folders)
         kinds = [n for n in objects.OBJECTS if "objects" in parts and not layout.object(n).exists()]
@@ -96,7 +96,7 @@ class DatasetGenerator:
 
     def make_group(self, group: str) -> None:
         """Write all missing parts of one group of scenes."""
-        layout, parts = self.layout, {*self.options.parts}
+        layout, parts = self.layout, {*self.options.needed_parts}
         paths = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in SCENE_PARTS)]
         _remove_partial(paths)
         self._write_checksums(group, paths)  # bring the list up to date after a killed run or removed files

@@ -45,7 +45,7 @@ class DatasetOptions:
     """Groups to generate, and the settings that determine their content."""
 
     groups: str = "3_0..3_9,4,6"
-    only: str = "motions"  # parts
+    parts: str = "motions"  # separated by commas
     frames: int = 100
     keypoints: int = 2048  # per object
     dx: float = 0.02  # grid spacing [m]
@@ -61,7 +61,7 @@ class DatasetOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        parse_parts(self.only), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
+        parse_parts(self.parts), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
         _parse_shard(self.shard)
         if self.frames < 1 or self.keypoints < 1 or self.limit < 0:
             raise InputError("--frames and --keypoints must be positive, --limit at least 0")
@@ -76,9 +76,9 @@ class DatasetOptions:
         return Discretisation(self.dx, self.spacing, self.substep)
 
     @property
-    def parts(self) -> tuple[str, ...]:
+    def needed_parts(self) -> tuple[str, ...]:
         """The requested parts and their prerequisites, prerequisites first."""
-        requested = parse_parts(self.only)
+        requested = parse_parts(self.parts)
         needed = {*requested}.union(*(PREREQUISITES.get(part, set()) for part in requested))
         return tuple(p for p in PARTS if p in needed)
 
@@ -104,7 +104,7 @@ class DatasetOptions:
 
         Always so for mpm and dynamic: missing scenes of these are simulated again separately.
         """
-        return self.exact or bool({"mpm", "dynamic"} & {*self.parts})
+        return self.exact or bool({"mpm", "dynamic"} & {*self.needed_parts})
 
     @property
     def settings(self) -> dict:

@@ -70,7 +70,7 @@ class GroupFiles:
     def missing(self, scene: str) -> MissingFiles:
         """Files of the requested parts that do not exist."""
         layout, group = self.layout, self.group
-        parts, backgrounds = self.options.parts, self.options.background_names
+        parts, backgrounds = self.options.needed_parts, self.options.background_names
         videos = {}
         for b in backgrounds if "dynamic" in parts else ():
             paths = {v: layout.dynamic(group, scene, b, v) for v in self.options.view_indices}

@@ -40,11 +40,11 @@ def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
 
 
 def parse_parts(text: str) -> tuple[str, ...]:
-    """Parse --only: "mpm, scenes" -> ("scenes", "mpm"), in the order in which parts are made; InputError if unknown."""
+    """Parse --parts: "mpm, scenes" -> ("scenes", "mpm"), in the order in which they are made; InputError if unknown."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = next((name for name in names if name not in PARTS), None)
     if unknown is not None or not names:
-        raise InputError(f"--only {unknown or text!r}: choose from {', '.join(PARTS)}")
+        raise InputError(f"--parts {unknown or text!r}: choose from {', '.join(PARTS)}")
     return tuple(p for p in PARTS if p in names)
 
 

@@ -113,7 +113,7 @@ def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch, devic
     pytest.importorskip("pycolmap")
     write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)
-    options = bench.ReconstructBenchOptions(cameras=True)
+    options = bench.ReconstructBenchOptions(cameras_only=True)
     lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
     row = json.loads((tmp_path / "r.json").read_text())["sets"][f"set, normal, {device}, cameras"]
     assert row["placed"] == row["photos"] == row["poses"]["cameras"] == 4 and "4/  4" in lines[1]

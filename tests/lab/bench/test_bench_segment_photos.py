@@ -40,7 +40,7 @@ def test_ready_scenes_give_a_row_and_a_table(sets):
     assert (row["photos"], row["placed"], row["labelled_photos"], row["objects"], row["found"]) == (2, 2, 1, 2, 2)
     assert row["recall"] == 0.5 and 0.4 < row["PQ"] <= 0.5 and set(row["objects_iou"]) == {"duck", "cup"}
     assert row["by_labels"]["recall"] == 1 and row["by_labels"]["PQ"] > 0.8
-    assert "torch" in facts["machine"] and facts["command"] == "ngff-lab bench segment --photos"
+    assert "torch" in facts["machine"] and facts["command"] == "ngff-lab bench segment PHOTOSET..."
     assert lines[-1].startswith("desk") and "2 of 2" in lines[-1] and "ready" in lines[-1]
     table = (sets / "out.md").read_text().splitlines()
     assert table[-3].startswith("| set |") and table[-1].startswith("| desk | 2 of 2 | 1 | 2 | 2 | 0.50 |")
@@ -83,9 +83,7 @@ def test_folder_of_the_labels(sets):
 
 def test_command_line(sets):
     options = ["--labels", str(sets / "labels"), "--labelled", str(sets / "ready"), "--json"]
-    done = CliRunner().invoke(app, ["bench", "segment", "--photos", str(sets / "desk"), *options])
+    done = CliRunner().invoke(app, ["bench", "segment", str(sets / "desk"), *options])
     assert done.exit_code == 0 and '"recall": 0.5' in done.stdout
-    done = CliRunner().invoke(app, ["bench", "segment", str(sets / "desk")])
-    assert done.exit_code == 2 and "add --photos" in done.stderr
-    done = CliRunner().invoke(app, ["bench", "segment", "--photos"])
-    assert done.exit_code == 2 and "name one or more photo sets" in done.stderr
+    done = CliRunner().invoke(app, ["bench", "segment", "--labels", str(sets / "labels")])
+    assert done.exit_code == 2 and "name their folders (PHOTOSET)" in done.stderr

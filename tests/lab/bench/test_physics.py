@@ -64,7 +64,7 @@ def test_a_slightly_leaning_block_turns_as_a_linear_pendulum_upside_down():
 
 
 def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
-    options = PhysicsBenchOptions(only=("fall/gravity=25",), engines=("rigid",))
+    options = PhysicsBenchOptions(only="fall/gravity=25", engines=("rigid",))
     (line, total) = run(tmp_path / "p.json", options)
     assert line.startswith("ok") and total == "rigid: 1 of 1 agree with theory"
     facts = json.loads((tmp_path / "p.json").read_text())
@@ -72,7 +72,7 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
     (tmp_path / "p.json").write_text(json.dumps(facts))
     (line, total) = run(tmp_path / "p.json", options)
     assert line.startswith("--") and "9.000" in line and total == "rigid: 0 of 1 agree with theory"
-    more = PhysicsBenchOptions(only=("fall/gravity=9.81",), engines=("rigid",))
+    more = PhysicsBenchOptions(only="fall/gravity=9.81", engines=("rigid",))
     list(run(tmp_path / "p.json", more))
     page = (tmp_path / "p.md").read_text()
     assert "| fall/gravity=25 | fall [m] | 0.180 | (9.000) |" in page and "`rigid` 1 of 2" in page
@@ -81,14 +81,21 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
 
 
 def test_auto_is_measured_with_the_engine_that_it_takes(tmp_path):
-    (line, total) = run(tmp_path / "p.json", PhysicsBenchOptions(only=("fall/gravity=25",), engines=("auto",)))
+    (line, total) = run(tmp_path / "p.json", PhysicsBenchOptions(only="fall/gravity=25", engines=("auto",)))
     row = json.loads((tmp_path / "p.json").read_text())["rows"]["fall/gravity=25"]["auto"]
     assert row["passes"] and row["engines"] == ["rigid"] and " auto rigid " in line and total.startswith("auto: 1 of 1")
     assert "| `auto` |" in (tmp_path / "p.md").read_text()
 
 
+def test_experiments_are_chosen_by_groups_and_patterns():
+    assert not any("," in name for name in ALL)  # which separates them in --only
+    names = [e.name for e in chosen("roll, tower/3*")]
+    assert names == ["roll/10deg", "roll/25deg", "tower/3 for 2s"]
+    assert len(chosen("")) == len(ALL)
+
+
 def test_unknown_experiments_and_engines_are_errors():
     with pytest.raises(InputError, match="groups are bounce, boxes, collision"):
-        chosen(("jump",))
+        chosen("slide,jump")
     with pytest.raises(InputError, match="--engine warp"):
         PhysicsBenchOptions(engines=("warp",))

@@ -34,7 +34,7 @@ NUMBER = 26  # of a small scene
 @pytest.fixture(scope="module")
 def scene():
     """A scene of a few things, with one part and with several."""
-    return make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
+    return make_scene(NUMBER, Shelf((), 0), ClutterOptions(views=4))[0]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_objects_of_the_data_set_keep_their_area_when_thinned(monkeypatch):
 
 
 def test_a_scene_is_the_same_from_one_seed(scene):
-    again = make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
+    again = make_scene(NUMBER, Shelf((), 0), ClutterOptions(views=4))[0]
     assert torch.equal(again.gaussians.means, scene.gaussians.means)
     assert torch.equal(again.cameras.viewmats, scene.cameras.viewmats)
 
@@ -91,7 +91,7 @@ def test_offsets_lead_to_the_middle_of_the_object(exact):
 @pytest.mark.slow
 def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
     """Photos with cameras that a reconstruction can use; observations; weights that load and label a scene."""
-    options = ClutterOptions(count=1, photos=4, size=96, first=6)
+    options = ClutterOptions(count=1, views=4, size=96, first=6)
     assert len(list(run(tmp_path / "photos", options))) == 1
     assert not list(run(tmp_path / "photos", options))  # finished scenes are kept
     folder = tmp_path / "photos" / "0006"
@@ -100,11 +100,11 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
     truth = read_scene(folder / "truth.ply")
     truth = replace(truth, gaussians=truth.gaussians[::10])
 
-    list(run(tmp_path / "noisy", ClutterOptions(count=1, photos=4, size=96, first=6, observations=1)))
+    list(run(tmp_path / "noisy", ClutterOptions(count=1, views=4, size=96, first=6, observations=1)))
     example = read_example(tmp_path / "noisy" / "0006" / "observed_0.safetensors")
     assert len(example.surfels) == len(example.labels) > 1000
 
-    list(run(tmp_path / "exact", ClutterOptions(count=1, photos=4, size=96, first=6, exact=True)))
+    list(run(tmp_path / "exact", ClutterOptions(count=1, views=4, size=96, first=6, exact=True)))
     exact = read_example(tmp_path / "exact" / "0006" / "observed_exact.safetensors")
     assert exact.labels.min() == 0 and exact.labels.max() == len(truth.objects)
 
@@ -141,7 +141,7 @@ def _with_fewer_score_features(weights: Path, out: Path) -> Path:
 
 def test_close_scenes_have_few_large_things(monkeypatch):
     monkeypatch.setattr(scenes, "CLOSE_SHARE", 1.0)
-    scene = make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
+    scene = make_scene(NUMBER, Shelf((), 0), ClutterOptions(views=4))[0]
     g = scene.gaussians
     sides = [(m.amax(0) - m.amin(0)).norm() for m in (g.means[g.object_id == o.id] for o in scene.objects)]
     assert 1 <= len(sides) <= 3 and min(sides) > 0.9 * scenes.CLOSE_SIZES[0]

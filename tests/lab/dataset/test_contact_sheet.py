@@ -19,7 +19,7 @@ def test_one_row_per_scene_from_first_to_last_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "IMAGE_SIZE", SIZE)
     with pytest.raises(InputError, match="has none of 3_9"):
         write_sheet(tmp_path, tmp_path / "s.jpg", SheetOptions(groups=("3_9",), count=2))
-    generate.run(tmp_path, replace(OPTIONS, groups="3_9,4", only="motions", frames=20))
+    generate.run(tmp_path, replace(OPTIONS, groups="3_9,4", parts="motions", frames=20))
     write_sheet(tmp_path, tmp_path / "s.jpg", SheetOptions(groups=("3_9", "4"), count=2))
     sheet = cv2.imread(str(tmp_path / "s.jpg")).astype(float)
     assert sheet.shape == (2 * SIZE, SHEET_COLUMNS * SIZE, 3)

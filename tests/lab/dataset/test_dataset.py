@@ -102,7 +102,7 @@ def test_scene_names_that_are_no_file_names_are_rejected(tmp_path, name):
     path.parent.mkdir()
     write_scene_configs(path, {name: SceneConfig(name, (0,), ((0.0, 0.0, 0.0),), (1.0,))})
     with pytest.raises(InputError, match="3_9.json: the scene name .* cannot be a file name"):
-        generate.run(tmp_path, DatasetOptions(groups="3_9", only="scene_configs,motions"))
+        generate.run(tmp_path, DatasetOptions(groups="3_9", parts="scene_configs,motions"))
     assert not [*tmp_path.rglob("*.h5")]
 
 
@@ -218,7 +218,7 @@ def test_interrupted_run_resumes_to_the_same_bytes(tmp_path, assets, monkeypatch
         monkeypatch.setitem(SCENE_COUNTS, group, 3)
     monkeypatch.setattr(generate, "load_assets", lambda *_: assets)
     options = DatasetOptions(
-        groups="3_0,4", only="motions", frames=3, keypoints=50, dx=COARSE.dx, spacing=COARSE.spacing,
+        groups="3_0,4", parts="motions", frames=3, keypoints=50, dx=COARSE.dx, spacing=COARSE.spacing,
         substep=COARSE.substep, exact=True, limit=2,
     )  # fmt: skip
     generate.run(tmp_path, options)

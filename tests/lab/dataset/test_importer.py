@@ -106,7 +106,7 @@ def test_imported_trajectory_can_be_rendered_and_evaluated(published, small, tmp
 def test_generated_frames_round_trip(tmp_path, monkeypatch):
     """Skinning to keypoints reproduces the frames of all particles to about float16 precision."""
     shrink(monkeypatch.setattr, monkeypatch.setitem)
-    generate.run(tmp_path, replace(OPTIONS, only="scenes,mpm", frames=12, limit=1))
+    generate.run(tmp_path, replace(OPTIONS, parts="scenes,mpm", frames=12, limit=1))
     folder = next((tmp_path / "mpm" / "3_9").iterdir())
     importer.run(folder, tmp_path / "t.h5", count=128)
     t = read_trajectory(tmp_path / "t.h5")

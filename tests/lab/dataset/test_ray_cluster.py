@@ -10,7 +10,7 @@ from stages.core.errors import InputError
 from stages.lab.dataset import generate, ray_cluster
 from tests.lab.small_world import OPTIONS, shrink
 
-MOTIONS = replace(OPTIONS, groups="3_9,4", only="motions,scenes", limit=2)
+MOTIONS = replace(OPTIONS, groups="3_9,4", parts="motions,scenes", limit=2)
 
 
 def test_missing_ray_is_reported_with_its_install_command(monkeypatch, tmp_path):

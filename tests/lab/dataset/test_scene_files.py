@@ -167,7 +167,7 @@ def test_damaged_files_are_found_and_repaired(data, options):
 
 @pytest.mark.slow
 def test_killed_run_resumes_to_the_same_bytes(data, tmp_path, options):
-    part = f"replace(OPTIONS, only='scenes,mpm', device={options.device!r})"
+    part = f"replace(OPTIONS, parts='scenes,mpm', device={options.device!r})"
     code = ("import os; from dataclasses import replace; from pathlib import Path\n"
             "from stages.lab.dataset import gaussian_frames, generate\n"
             "from tests.lab.small_world import OPTIONS, shrink_process; shrink_process()\n"
@@ -180,7 +180,7 @@ def test_killed_run_resumes_to_the_same_bytes(data, tmp_path, options):
     process = subprocess.run([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     assert process.returncode == -9 and list(tmp_path.glob("mpm/3_9/.part-*/0000.h5"))
     assert not (tmp_path / "sums" / "3_9.sha256").exists()  # the group was not complete
-    generate.run(tmp_path, replace(options, only="scenes,mpm"))
+    generate.run(tmp_path, replace(options, parts="scenes,mpm"))
     files = {n: d for n, d in digests(tmp_path).items() if n.startswith(("scene", "mpm", "objects"))}
     whole = digests(data)
     assert files == {n: whole.get(n) for n in files} and len(list((tmp_path / "mpm" / "3_9").iterdir())) == 2
@@ -221,8 +221,8 @@ def test_size_estimates_match_the_files(data):
     assert config.stat().st_size == pytest.approx(2 * sizes.config(3), rel=0.15)
 
 
-@pytest.mark.parametrize("options", [{"only": "videos"}, {"views": "3"}, {"backgrounds": "table9"}, {"resolution": 33},
-                                     {"only": ""}, {"shard": "0/2"}])  # fmt: skip
+@pytest.mark.parametrize("options", [{"parts": "videos"}, {"views": "3"}, {"backgrounds": "table9"}, {"resolution": 33},
+                                     {"parts": ""}, {"shard": "0/2"}])  # fmt: skip
 def test_invalid_options_are_rejected(options):
     with pytest.raises(InputError, match=f"--{next(iter(options))}"):
         DatasetOptions(**options)

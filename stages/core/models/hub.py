@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import sha256
 
 log = logging.getLogger(__name__)
@@ -36,12 +36,12 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
     choose: picks files from those of the repository; may raise ValueError.
     place: end of the error message, naming where to put manually downloaded files.
     Size, licence and sha256, as stated by the hub, are logged before the download; files are checked against that
-    sha256. Raises InputError if the hub cannot be reached, a file is corrupt or the package is missing.
+    sha256. Raises InputError if the hub cannot be reached or a file is corrupt, and MissingPackage without the package.
     """
     try:
         import huggingface_hub as hub
     except ImportError as error:
-        raise InputError(
+        raise MissingPackage(
             "--download: needs the package huggingface_hub (`pip install 'ngff[hub]'`); or fetch the weights from "
             f"https://huggingface.co/{source.repository} yourself and name the file with --weights"
         ) from error

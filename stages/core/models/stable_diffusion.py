@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.hub import HubSource
 
 if TYPE_CHECKING:
@@ -23,14 +23,14 @@ def read_parts(
 ) -> dict[str, Any]:
     """The parts by the names of their subfolders, networks in 32 bit, the scheduler made from its configuration.
 
-    `user`: the network that needs them, `version`: of Stable Diffusion. Raises InputError for missing packages, for
-    files that are damaged or lack tensors, and where `scheduler` raises ValueError.
+    `user`: the network that needs them, `version`: of Stable Diffusion. Raises MissingPackage without diffusers or
+    transformers, and InputError for files that are damaged or lack tensors, and where `scheduler` raises ValueError.
     """
     try:
         import diffusers
         import transformers
     except ImportError as error:
-        raise InputError(
+        raise MissingPackage(
             f"{user}: needs the packages diffusers and transformers (`pip install 'ngff[diffsplat]'`)"
         ) from error
     transformers.utils.logging.disable_progress_bar()

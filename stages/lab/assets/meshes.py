@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.field_sampling import diffuse_light, normalise_size
@@ -29,8 +29,8 @@ def read_mesh(files: Path | Sequence[Path], count: int, up: str = "auto", light:
 
     The object is all meshes of a file, or of several, in their common coordinates. `up` is the axis that points up
     (auto: y for glTF, as its standard defines, else z). `light` bakes the soft light of the generated objects into the
-    colours of the file. Raises InputError when a file cannot be read, has no faces, trimesh is missing, or an argument
-    is invalid.
+    colours of the file. Raises MissingPackage without trimesh, and InputError when a file cannot be read, has no
+    faces, or an argument is invalid.
     """
     files = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
     path = files[0]
@@ -58,7 +58,7 @@ def _load(path: Path) -> list:
     try:
         import trimesh  # an optional extra
     except ImportError as error:
-        raise InputError(f"{path}: reading meshes needs trimesh; install it with `pip install 'ngff[mesh]'`") from error
+        raise MissingPackage(f"{path}: reading meshes needs trimesh: `pip install 'ngff[mesh]'`") from error
     try:
         scene = trimesh.load_scene(path, process=False)  # processing would merge vertices closer than 1e-8
         meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.lab.dataset.disk_usage import missing_bytes, require_disk_space
 from stages.lab.dataset.generate import DatasetGenerator
 from stages.lab.dataset.options import DatasetOptions
@@ -27,13 +27,13 @@ from stages.lab.dataset.options import DatasetOptions
 def run(out: Path, options: DatasetOptions, address: str) -> None:
     """Write all missing files, as generate.run does, with one task per group and one GPU per task if there are any.
 
-    `address` is "local", "auto" or the address of a cluster. Raises InputError when Ray is not installed, the cluster
-    does not answer, or it has no GPU though --device cuda was given.
+    `address` is "local", "auto" or the address of a cluster. Raises MissingPackage without Ray, and InputError when
+    the cluster does not answer, or has no GPU though --device cuda was given.
     """
     try:
         import ray
     except ImportError as error:
-        raise InputError("--ray: Ray is not installed; install it with `pip install 'ngff[ray]'`") from error
+        raise MissingPackage("--ray: Ray is not installed; install it with `pip install 'ngff[ray]'`") from error
     out = Path(out).resolve()
     generator = DatasetGenerator(out, options)  # makes the inputs shared by all groups, before the tasks start
     generator.make_shared()

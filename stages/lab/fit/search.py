@@ -187,7 +187,7 @@ def _evolve(
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it
     except ImportError as error:
-        raise MissingPackage("a fit needs the package cma, which is not installed; `pip install cma`") from error
+        raise MissingPackage("a fit needs the package cma: `pip install 'ngff[fit]'`") from error
 
     size = options.workers * -(-(4 + int(3 * np.log(len(x)))) // options.workers)  # the usual one, for all workers
     middle = known.x if attempt % 2 else x

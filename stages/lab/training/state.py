@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, save_tensors
 
@@ -168,5 +168,5 @@ def _optimizer(kind: str, params: list[Tensor], lr: float) -> torch.optim.Optimi
     try:
         from pytorch_optimizer import SOAP
     except ImportError as error:
-        raise InputError("--optimizer soap needs the package pytorch-optimizer; pip install 'ngff[train]'") from error
+        raise MissingPackage("--optimizer soap needs pytorch-optimizer: `pip install 'ngff[train]'`") from error
     return SOAP(params, lr, betas=(0.95, 0.95), weight_decay=1e-4)

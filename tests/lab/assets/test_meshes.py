@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
@@ -154,7 +154,7 @@ def test_wrong_files_and_options_are_rejected(tmp_path, trimesh):
 def test_missing_trimesh_is_reported_with_its_install_command(tmp_path, monkeypatch):
     path = textured_box(tmp_path)
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(InputError, match=r"pip install 'ngff\[mesh\]'"):
+    with pytest.raises(MissingPackage, match=r"pip install 'ngff\[mesh\]'"):
         read_mesh(path, 1000)
 
 

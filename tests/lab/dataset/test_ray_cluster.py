@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.core.errors import InputError
+from stages.core.errors import MissingPackage
 from stages.lab.dataset import generate, ray_cluster
 from tests.lab.small_world import OPTIONS, shrink
 
@@ -15,7 +15,7 @@ MOTIONS = replace(OPTIONS, groups="3_9,4", parts="motions,scenes", limit=2)
 
 def test_missing_ray_is_reported_with_its_install_command(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    with pytest.raises(InputError, match=r"pip install 'ngff\[ray\]'"):
+    with pytest.raises(MissingPackage, match=r"pip install 'ngff\[ray\]'"):
         ray_cluster.run(tmp_path, MOTIONS, "local")
 
 

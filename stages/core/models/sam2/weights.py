@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.hub import HubSource, fetch, folders
 from stages.core.models.pi3.weights import read_state
 from stages.core.scene.files import must_exist
@@ -84,14 +84,14 @@ def _choose(files: list) -> list:
 def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
     """The network with the weights of a file and the architecture of the config.json next to it; float32, eval mode.
 
-    Raises InputError where transformers is absent or older than SAM 2, and for files that are damaged, incomplete or
-    of another network.
+    Raises MissingPackage where transformers is absent or older than SAM 2, and InputError for files that are damaged,
+    incomplete or of another network.
     """
     try:
         from transformers import Sam2VideoConfig, Sam2VideoModel
         from transformers.utils import logging as reports
     except ImportError as error:
-        raise InputError("sam2: needs transformers 4.56 or newer: `pip install -U 'ngff[sam2]'`") from error
+        raise MissingPackage("sam2: needs transformers 4.56 or newer: `pip install -U 'ngff[sam2]'`") from error
     config = _config(Sam2VideoConfig, Path(path).with_name("config.json"))
     reports.disable_progress_bar()
     level = reports.get_verbosity()

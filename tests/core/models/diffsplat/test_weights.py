@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.diffsplat.download import download
 from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET, find, gaussian_vae, load
 from stages.core.scene.files import sha256
@@ -86,7 +86,7 @@ def test_mismatched_weights_are_refused(copy):
 
 def test_missing_package_is_named(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(InputError, match=r"ngff\[diffsplat\]"):
+    with pytest.raises(MissingPackage, match=r"ngff\[diffsplat\]"):
         load(find(folder))
 
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.osediff.weights import BASE, LORA, find, load, merge_lora, read_lora
 from tests.core.models.osediff.tiny_model import lora_file, unet
 
@@ -105,7 +105,7 @@ def test_another_base_is_refused(folder, tmp_path):
 
 def test_missing_package_is_reported(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(InputError, match=r"osediff: .*ngff\[diffsplat\]"):
+    with pytest.raises(MissingPackage, match=r"osediff: .*ngff\[diffsplat\]"):
         load(find(folder))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.pi3.download import download
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.splat import Pi3Splat
@@ -142,5 +142,5 @@ def test_missing_network_or_package_is_explained(hub, monkeypatch):
     with pytest.raises(InputError, match="no route to host.*save it as .*pi3.safetensors"):
         download("pi3")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(InputError, match=r"pip install 'ngff\[hub\]'"):
+    with pytest.raises(MissingPackage, match=r"pip install 'ngff\[hub\]'"):
         download("pi3")

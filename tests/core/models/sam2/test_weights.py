@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.models.sam2.weights import download, find, load
 from stages.core.scene.files import sha256
 from tests.core.models.sam2.tiny_model import random_model, save_tiny_model
@@ -81,7 +81,7 @@ def test_damaged_files_are_refused(tmp_path):
 def test_missing_transformers_names_the_extra(tmp_path, monkeypatch):
     file = find(save_tiny_model(tmp_path / "a"))
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(InputError, match=r"pip install -U 'ngff\[sam2\]'"):
+    with pytest.raises(MissingPackage, match=r"pip install -U 'ngff\[sam2\]'"):
         load(file)
 
 

@@ -22,10 +22,13 @@ class Backend:
     extra: str = ""  # extra of this project that installs the package
 
 
-def choose(table: Mapping[str, str | Backend], name: str) -> Callable:
-    """The function that a table of "module:function" entries or of rows lists under `name`; InputError if unknown."""
+def choose(table: Mapping[str, str | Backend], option: str, name: str) -> Callable:
+    """The function that a table of "module:function" entries or of rows lists under `name`.
+
+    `option`: as typed on the command line, for the InputError where the table lacks the name.
+    """
     if name not in table:
-        raise InputError(f"no backend called {name!r}; choose from {', '.join(table)}")
+        raise InputError(f"{option} {name}: choose from {', '.join(table)}")
     row = table[name]
     return load(row if isinstance(row, str) else row.entry)
 

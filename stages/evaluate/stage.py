@@ -10,7 +10,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, provenance, replacing
 from stages.core.scene.formats import FORMATS
@@ -78,7 +78,7 @@ def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptio
     (prediction,), truth = predictions, Path(truth)
     kind = _common_kind(prediction, truth)
     _check_options(kind, options)
-    return choose(COMPARISONS, kind)(prediction, truth, options), [prediction, truth]
+    return load(COMPARISONS[kind])(prediction, truth, options), [prediction, truth]
 
 
 def _judge(films: list[Path], truth: Path | None, out: Path, options: EvaluateOptions) -> tuple[Result, list[Path]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.reconstruct import features
 from stages.reconstruct.epipolar import EpipolarLines
 from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
@@ -41,7 +41,7 @@ def build_database(
     Where the poses `viewmats` are known, verified matches are those along their epipolar lines; else a geometry is
     fitted to the matches, which a pattern that repeats may mislead.
     """
-    extract = choose(FEATURE_EXTRACTORS, matching.matcher)
+    extract = load(FEATURE_EXTRACTORS[matching.matcher])
 
     def write(path: Path) -> None:
         found = steps.cached("features", lambda: extract(photos, matching.device))
@@ -136,7 +136,7 @@ def _match_and_verify(
     options.ransac.max_num_trials = 3000  # pairs that need more have too few inliers
     pixels = [table[:, :2].double().numpy() for table, *_ in found]
     vectors = [features.normalise(descriptors) for _, descriptors, *_ in found]
-    match = choose(FEATURE_MATCHERS, matching.matcher)(found, [(c.width, c.height) for c in cameras], matching.device)
+    match = load(FEATURE_MATCHERS[matching.matcher])(found, [(c.width, c.height) for c in cameras], matching.device)
 
     def guided(i: int, j: int, matches: np.ndarray) -> tuple:
         """The same with matches along epipolar lines: other tiles of a pattern are mostly not on them."""

@@ -52,7 +52,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it
     for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
-    began, backend = time.monotonic(), choose(BACKENDS, options.backend)
+    began, backend = time.monotonic(), choose(BACKENDS, "--backend", options.backend)
     if options.sequence:
         from stages.reconstruct.filmed_sequence import read_sequence  # noqa: PLC0415 -- most runs read photos
 

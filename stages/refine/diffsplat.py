@@ -33,7 +33,7 @@ def complete(
 ) -> Gaussians:
     """The completer "diffsplat": Gaussians of the generated object where it was not seen, if it fits."""
     device = pick_device(options.device)
-    upscaler = choose(UPSCALERS, options.upscale)(options)
+    upscaler = choose(UPSCALERS, "--upscale", options.upscale)(options)
     model = _model(options.weights, options.download, device)
     own, name = opaque_gaussians(scene, number), scene.name_of(number)
     side = RESTORED_SIDE if upscaler else model.side

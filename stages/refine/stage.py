@@ -67,7 +67,7 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
     """The three steps for objects on `support`."""
-    completer = choose(BACKENDS, options.chosen)
+    completer = choose(BACKENDS, "--completer", options.chosen)
     g = scene.gaussians
     stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
     observed = ObservedSpace.of(replace(scene, gaussians=g[~stray]), pick_device(options.device))

@@ -24,7 +24,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
 
     Raises InputError for invalid inputs; then nothing is written.
     """
-    began, segment = time.monotonic(), choose(BACKENDS, options.chosen)
+    began, segment = time.monotonic(), choose(BACKENDS, "--backend", options.chosen)
     pick_device(options.device)  # raises for an absent GPU; only networks use one
     whole = read_scene(scene)
     check_output(Path(out))

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from stages.core.backends import choose, pick_device
+from stages.core.backends import load, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
@@ -57,7 +57,7 @@ def run(
     keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     options = with_engine(options, world, keypoints, prompts)
     prompts = for_engine(prompts, world, options)
-    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    rollout = load(ENGINES[options.engine].rollout)
     inputs = [scene, *segment_files(choose_materials(world.objects, options.material, options.materials))]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)

@@ -1,10 +1,17 @@
-"""The device of --device."""
+"""Choices by name, and the device of --device."""
 
 import pytest
 import torch
 
-from stages.core.backends import pick_device
+from stages.core.backends import Backend, choose, pick_device
 from stages.core.errors import InputError
+
+
+def test_an_unknown_name_is_reported_with_its_option():
+    table = {"add": "operator:add", "mul": Backend("operator:mul", "the product")}
+    assert choose(table, "--backend", "mul")(2, 3) == 6 and choose(table, "--backend", "add")(2, 3) == 5
+    with pytest.raises(InputError, match="--backend magic: choose from add, mul"):
+        choose(table, "--backend", "magic")
 
 
 @pytest.mark.parametrize("name", ["gpu", "cpu:0", "cuda:", "cuda:x", "cuda:-1", "auto:0"])

@@ -306,7 +306,7 @@ def test_invalid_options_are_refused(wrong, message):
 
 
 def test_unknown_completer_is_refused(before):
-    with pytest.raises(InputError, match="no backend called 'magic'"):
+    with pytest.raises(InputError, match="--completer magic: choose from close, "):
         refine(before, RefineOptions(completer="magic"))
 
 

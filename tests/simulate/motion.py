@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor, stack
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.core.physics import forces
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.field_start import FieldStart
@@ -29,7 +29,7 @@ def roll_out(scene: Scene, options: SimulateOptions) -> Motion:
     """The motion that `ngff simulate` would write of a labelled scene, with an engine named in the options."""
     keypoints = choose_keypoints(scene, options.keypoint_count, options.seed)
     prompts = forces.parse(scene.objects, options.force, options.pin, options.velocity, options.lift)
-    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    rollout = load(ENGINES[options.engine].rollout)
     states = list(rollout(scene, keypoints, prompts, options))
     frames = (stack([getattr(s, name) for s in states]).cpu() for name in ("positions", "com", "rotation"))
     return Motion(keypoints, *frames, states[0].start)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.core.errors import InputError
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
@@ -36,7 +36,7 @@ def small_draft(monkeypatch):
 
 def frames(scene: Scene, prompts: ForcePrompts, **chosen) -> list:
     options = SimulateOptions(keypoints=16, quality="draft", dt=DT, **chosen)
-    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    rollout = load(ENGINES[options.engine].rollout)
     return list(rollout(scene, choose_keypoints(scene, 16), prompts, options))
 
 

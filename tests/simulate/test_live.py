@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.core.errors import InputError, MissingPackage
 from stages.core.physics.forces import Change, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints, pull_range
@@ -100,7 +100,7 @@ def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,
     contact = "learned" if engine == "ngff" else AUTO
     options = SimulateOptions(engine=engine, contact=contact, quality="draft", steps=frames, keypoints=32, box=box)
     keypoints = choose_keypoints(world, 32)
-    rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)
+    rollout = load(ENGINES[engine].rollout)
     walls = parse_box(box)
     session = Session(
         ForcePrompts(), keypoints, [1, 2], options.gravity, 1.0, *pull_range(keypoints, walls.low, walls.high)

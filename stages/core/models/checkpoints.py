@@ -33,8 +33,8 @@ SHIPPED = Path(__file__).parent / "weights"  # shipped in the package
 
 
 def build(name: str, **config) -> Dynamics:
-    """An untrained model by its name in MODELS; `config`: arguments of its class."""
-    return choose(MODELS, name)(**config)
+    """An untrained model by its name in MODELS, else InputError; `config`: arguments of its class."""
+    return choose(MODELS, "MODEL", name)(**config)
 
 
 def find(name: str, given: Path | None = None) -> Path:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from stages.core.backends import choose
+from stages.core.backends import load
 from stages.core.errors import InputError
 from stages.lab.names import chosen_names
 
@@ -72,7 +72,7 @@ def make_object(name: str) -> Gaussians:
     """
     from stages.lab.assets.shapes import single_threaded
 
-    make = choose({kind.name: kind.make for kind in OBJECTS.values()}, _known(name))
+    make = load(OBJECTS[_known(name)].make)
     with single_threaded():
         g = make()
     side = OBJECTS[name].side

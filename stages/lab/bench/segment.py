@@ -22,7 +22,7 @@ from jaxtyping import Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.backends import choose, load
+from stages.core.backends import load
 from stages.core.errors import InputError
 from stages.core.perception.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 from stages.core.scene.scene import Scene
@@ -116,12 +116,12 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
 def segment_by_network(scene: Scene, name: str, options: SegmentBenchOptions) -> Int[Tensor, "n"]:
     """Object ids of a network backend, without prompts, from rendered views of the scene."""
     chosen = SegmentOptions(backend=name, weights=options.weights, device=options.device)
-    return choose(BACKENDS, name)(scene, chosen).gaussians.object_id
+    return load(BACKENDS[name].entry)(scene, chosen).gaussians.object_id
 
 
 def segment_without_prompts(scene: Scene, name: str, device: str) -> Scene:
     """The scene with the objects that a backend of AUTOMATIC finds with its default options."""
-    return choose(BACKENDS, name)(scene, SegmentOptions(backend=name, device=device))
+    return load(BACKENDS[name].entry)(scene, SegmentOptions(backend=name, device=device))
 
 
 def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[str]]:

@@ -48,7 +48,7 @@ def run(
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     pick_device(options.device)  # a wrong name is an error with every engine
     check_output(Path(out))
-    world = with_objects(read_scene(scene), scene, options.device)
+    world = with_objects(read_scene(scene), scene, options.seed, options.device)
     tell_of_unseen_sides(world, Path(scene))
     stored = forces.ForcePrompts()
     if options.forces is not None:
@@ -103,11 +103,11 @@ def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> Simu
     return replace(options, **{k: v for k, v in recorded.items() if k not in given})
 
 
-def with_objects(scene: Scene, path: Path, device: str = "auto") -> Scene:
+def with_objects(scene: Scene, path: Path, seed: int = 0, device: str = "auto") -> Scene:
     """The scene with the objects that can move; one without labelled Gaussians is segmented as by `ngff segment`.
 
-    `device` is of the network. Objects without Gaussians, or without extent, are left out. Raises InputError when no
-    object is found.
+    `seed` and `device` are of the segmentation. Objects without Gaussians, or without extent, are left out. Raises
+    InputError when no object is found.
     """
     present = []
     for o in scene.objects:
@@ -124,7 +124,7 @@ def with_objects(scene: Scene, path: Path, device: str = "auto") -> Scene:
         raise InputError(f"{path}: its objects are points, which cannot be simulated; label it with `ngff segment`")
     from stages.core.models.segmenter.segment import segment_by_network  # noqa: PLC0415 -- only unlabelled scenes need it
 
-    grouped = segment_by_network(scene, device=pick_device(device))
+    grouped = segment_by_network(scene, seed=seed, device=pick_device(device))
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
         raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)

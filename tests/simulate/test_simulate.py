@@ -404,9 +404,24 @@ def test_a_scene_in_which_no_object_is_found_is_refused(balls, monkeypatch, tmp_
     )
     found = {"none": blank, "without Gaussians": replace(blank, objects=balls.objects)}
     for grouped in found.values():
-        monkeypatch.setattr(network_segmenter, "segment_by_network", lambda scene, device, grouped=grouped: grouped)
+        monkeypatch.setattr(network_segmenter, "segment_by_network", lambda *_, grouped=grouped, **__: grouped)
         with pytest.raises(InputError, match="s.ply: no objects were found in it; label them with `ngff segment`"):
             with_objects(blank, tmp_path / "s.ply")
+
+
+def test_the_seed_is_also_that_of_the_segmentation(balls, monkeypatch, tmp_path):
+    g, seeds = balls.gaussians, []
+    write_scene(tmp_path / "s.ply", replace(balls, gaussians=replace(g, object_id=torch.zeros_like(g.object_id))))
+
+    def nothing_found(scene, seed, **_):
+        seeds.append(seed)
+        return replace(scene, objects=())
+
+    monkeypatch.setattr(network_segmenter, "segment_by_network", nothing_found)
+    for seed in (7, 0):
+        with pytest.raises(InputError, match="no objects were found"):
+            run(tmp_path / "s.ply", tmp_path / "t.h5", SimulateOptions(seed=seed))
+    assert seeds == [7, 0]
 
 
 def test_a_part_in_which_nothing_is_is_named(balls, tmp_path, caplog):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.core.perception.grouping import GroupingOptions
+from stages.core.perception.object_limits import GroupingOptions
 from stages.core.perception.segmentation import segment_by_geometry
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from stages.core.backends import pick_device
-from stages.core.models.segmenter.segment import SegmenterOptions, segment_by_network
+from stages.core.models.segmenter.segment import segment_by_network
+from stages.core.perception.object_limits import ObjectLimits
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Objects of the scene, largest first, as `ngff simulate` finds them in a scene without labels."""
-    settings = SegmenterOptions(options.max_objects, options.min_size)
-    return segment_by_network(scene, settings, options.weights, options.seed, pick_device(options.device))
+    limits = ObjectLimits(options.max_objects, options.min_size)
+    return segment_by_network(scene, limits, options.weights, options.seed, pick_device(options.device))

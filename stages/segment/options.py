@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stages.core.backends import Backend, with_weights
 from stages.core.errors import InputError
+from stages.core.perception.object_limits import GroupingOptions
 from stages.segment.object_scale import parse_object_scale
 
 # a backend takes (scene, SegmentOptions) and returns the scene with labels and objects
@@ -41,9 +42,9 @@ class SegmentOptions:
     weights: Path | None = None  # of `learned`: segmenter.safetensors; of others: model.safetensors and config.json
     download: bool = False  # download missing weights
     names: str = ""  # "1=duck,2=bowl": replaces the automatic names
-    max_objects: int = 24
-    min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
-    detail: float = 0.41  # largest dissimilarity of two regions of one object; smaller values give more objects
+    max_objects: int = GroupingOptions.max_objects
+    min_size: float = GroupingOptions.min_size
+    detail: float = GroupingOptions.detail
     scale_reference: str = ""  # "object=1 height=0.12": a measured length [m]
     seed: int = 0
     device: str = "auto"

@@ -14,7 +14,8 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.models.segmenter.clicks import Click, clicked_ids
-from stages.core.models.segmenter.segment import SegmenterOptions, find, load_segmenter
+from stages.core.models.segmenter.segment import find, load_segmenter
+from stages.core.perception.object_limits import ObjectLimits
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
@@ -63,7 +64,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     names = list(dict.fromkeys(p.name for p in prompts))
     clicks = [Click(_surface(scene, p, options.undistorted), names.index(p.name) + 1, p.text) for p in prompts]
     model = load_segmenter(find(options.weights), pick_device(options.device))
-    ids = clicked_ids(scene, model, clicks, SegmenterOptions(options.max_objects, options.min_size))
+    ids = clicked_ids(scene, model, clicks, ObjectLimits(options.max_objects, options.min_size))
     present = set(ids.unique().tolist())
     objects = tuple(SceneObject(i, name) for i, name in enumerate(names, start=1) if i in present)
     return replace(scene, gaussians=replace(scene.gaussians, object_id=ids), objects=objects)

@@ -2,14 +2,13 @@
 
 import json
 import logging
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
-from stages.core.perception.grouping import GroupingOptions
 from stages.core.perception.voting import ViewFootprint, damp_votes, majority_labels, pool_votes, remove_outliers
 from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
@@ -53,10 +52,6 @@ def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth,
     assert labelled.provenance["command"] == "segment"
     counts = labelled.gaussians.object_id.bincount().tolist()
     assert all(f"{o.id}  {o.name}: {counts[o.id]} Gaussians, " in caplog.text for o in labelled.objects)
-
-
-def test_defaults_are_those_of_the_grouping_that_simulate_uses():
-    assert all(getattr(SegmentOptions, f.name) == f.default for f in fields(GroupingOptions))
 
 
 @pytest.mark.parametrize(("source", "size"), [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
+from stages.core.perception.object_limits import GroupingOptions
 from stages.core.perception.object_naming import object_names
 from stages.core.perception.region_growing import cielab_colours, grow_objects, table_colour
 from stages.core.perception.region_merging import RegionMerger, Voxels, oversegment, voxel_edges
@@ -39,17 +40,7 @@ MAX_WALL_OBJECT = 0.9  # longest side of an object on a wall, which often fills 
 MIN_GAUSSIANS_ABOVE = 20  # above the plane, or there are no objects
 
 
-@dataclass(frozen=True)
-class GroupingOptions:
-    """Parameters of grouping."""
-
-    max_objects: int = 24
-    min_size: float = 0.03  # of an object, along its longest side [camera distance]
-    detail: float = 0.41  # largest separation of two regions of one object; smaller values give more objects
-    seed: int = 0
-
-
-def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:
+def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:  # noqa: B008 -- frozen
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
     The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged

@@ -7,7 +7,8 @@ from dataclasses import replace
 from stages.core.perception.body_merging import merge_bodies
 from stages.core.perception.boundary_refinement import refine_boundaries
 from stages.core.perception.false_positives import remove_false_positives
-from stages.core.perception.grouping import GroupingOptions, group_objects, name_objects
+from stages.core.perception.grouping import group_objects, name_objects
+from stages.core.perception.object_limits import GroupingOptions
 from stages.core.perception.support import find_support, view_extent
 from stages.core.perception.wall import find_wall
 from stages.core.scene.scene import Scene

@@ -19,8 +19,9 @@ from tqdm import tqdm
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models.segmenter.network import CANDIDATE_FEATURES, Level, Prediction, Segmenter
-from stages.core.models.segmenter.segment import SegmenterOptions, best_objects, score_at
+from stages.core.models.segmenter.segment import best_objects, score_at
 from stages.core.models.segmenter.voxels import FEATURES, LAB, SCALES
+from stages.core.perception.object_limits import ObjectLimits
 from stages.core.scene.files import replacing
 from stages.evaluate.labels import LabelOverlap, PanopticScores
 from stages.lab.bench import common as bench
@@ -141,7 +142,7 @@ def _known(example: Example) -> Tensor:
 def found_objects(model: Segmenter, example: Example) -> Tensor:
     """Object of each surfel that the network finds, 0 for none, before outlines are cut."""
     scored = [score_at(example.surfels, scale, model) for scale in SCALES]
-    return best_objects([s.best(SegmenterOptions()) for s in scored])
+    return best_objects([s.best(ObjectLimits()) for s in scored])
 
 
 def _examples(folders: Sequence[Path], observation: str) -> list[Path]:

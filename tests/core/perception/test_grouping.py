@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.core.perception.grouping import GroupingOptions, group_objects
+from stages.core.perception.grouping import group_objects
+from stages.core.perception.object_limits import GroupingOptions
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import find_support, view_extent
 from stages.core.scene.gaussians import Gaussians, concatenate

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.models.segmenter.network import Segmenter
-from stages.core.models.segmenter.segment import REDUCTIONS, ScoredCandidates, SegmenterOptions, outlined, score_at
+from stages.core.models.segmenter.segment import REDUCTIONS, ScoredCandidates, outlined, score_at
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES
+from stages.core.perception.object_limits import ObjectLimits
 from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.scene import Scene
 
@@ -33,7 +34,7 @@ class Click:
 
 
 @torch.no_grad()
-def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options: SegmenterOptions) -> Int[Tensor, "n"]:
+def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], limits: ObjectLimits) -> Int[Tensor, "n"]:
     """Object number of each Gaussian, that of the clicks on it; 0 for the rest.
 
     An object is the candidate with the largest expected IoU that has all clicks of the object and none of the others.
@@ -49,7 +50,7 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options
     scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
     for at_scale in scored:
         paths = [_path(at_scale, (means - click.point).norm(dim=1) / view.radius) for click in clicks]
-        usable = at_scale.usable(options.min_size).numpy()
+        usable = at_scale.usable(limits.min_size).numpy()
         for number in {click.object for click in clicks}:
             own = [path for path, click in zip(paths, clicks, strict=True) if click.object == number]
             others = [path for path, click in zip(paths, clicks, strict=True) if click.object != number]

@@ -22,6 +22,7 @@ from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, VOXEL, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.grouping import name_objects
+from stages.core.perception.object_limits import ObjectLimits
 from stages.core.perception.support import find_support, view_extent
 from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.files import must_exist
@@ -40,14 +41,6 @@ MAX_OVERLAP = 0.25  # of two objects, of the smaller
 TURNS = (((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 1, 0), (1, 0, 0), (0, 0, 1)),
          ((-1, 0, 0), (0, -1, 0), (0, 0, 1)), ((0, -1, 0), (-1, 0, 0), (0, 0, 1)))  # fmt: skip
 COPIES = len(TURNS)  # of the scene whose predictions are averaged
-
-
-@dataclass(frozen=True)
-class SegmenterOptions:
-    """What counts as an object."""
-
-    max_objects: int = 24
-    min_size: float = 0.03  # along its longest side [camera distance]
 
 
 def find(given: Path | None = None) -> Path:
@@ -87,7 +80,7 @@ def load_segmenter(path: Path, device: torch.device | str = "cpu", new_scores: b
 
 def segment_by_network(
     scene: Scene,
-    options: SegmenterOptions = SegmenterOptions(),  # noqa: B008 -- frozen
+    limits: ObjectLimits = ObjectLimits(),  # noqa: B008 -- frozen
     weights: Path | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
@@ -98,7 +91,7 @@ def segment_by_network(
     InputError if there are no weights at `weights`.
     """
     support = find_support(scene, view_extent(scene), seed)
-    ids = object_ids(scene, load_segmenter(find(weights), device), options)
+    ids = object_ids(scene, load_segmenter(find(weights), device), limits)
     return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), support)
 
 
@@ -106,7 +99,7 @@ def segment_by_network(
 def object_ids(
     scene: Scene,
     model: Segmenter,
-    options: SegmenterOptions = SegmenterOptions(),  # noqa: B008
+    limits: ObjectLimits = ObjectLimits(),  # noqa: B008
 ) -> Int[Tensor, "n"]:
     """Object number of each Gaussian; 0 for the rest."""
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
@@ -114,9 +107,9 @@ def object_ids(
     if len(surfels) < 20:
         return ids
     scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
-    found = [s.best(options) for s in scored]
+    found = [s.best(limits) for s in scored]
     labels = best_objects([f if s.scale >= 1 else confirmed(f, scored[0]) for s, f in zip(scored, found, strict=True)])
-    labels = torch.where(labels <= options.max_objects, labels, 0)
+    labels = torch.where(labels <= limits.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
     ids = refine_outlines(scene, ids, device=model.input_projection.weight.device)
     few = ids.bincount() < MIN_GAUSSIANS
@@ -172,7 +165,7 @@ class ScoredCandidates:
         expected = torch.cat([iou * self.ious[:, None], torch.zeros(1, len(objects.gains))])
         return expected.amax(0).float()
 
-    def best(self, options: SegmenterOptions) -> Segmentation:
+    def best(self, limits: ObjectLimits) -> Segmentation:
         """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by surfels.
 
         That is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical image
@@ -182,7 +175,7 @@ class ScoredCandidates:
         surfels = torch.bincount(self.owner[self.owner >= 0], minlength=count)
         weight = torch.from_numpy(self.candidates.sums(surfels[:, None])[:, 0])
         gain = weight * (self.ious - OBJECT_COST)
-        nodes = self.candidates.tree.best(torch.where(self.usable(options.min_size), gain, -1.0).double().numpy())
+        nodes = self.candidates.tree.best(torch.where(self.usable(limits.min_size), gain, -1.0).double().numpy())
         labels = self.labels(nodes)
         return Segmentation(labels, gain[nodes], torch.bincount(labels[labels >= 0], minlength=len(nodes)))
 

@@ -9,6 +9,8 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
 from stages.core.models.segmenter import clicks
 from stages.core.models.segmenter.voxels import SCALES
+from stages.core.perception import view_outlines
+from stages.core.perception.voting import ViewFootprint
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.points import parse_points, segment
@@ -36,6 +38,29 @@ def test_the_objects_at_the_points_are_found_with_their_names(device, monkeypatc
     overlap = best_overlap(found.gaussians.object_id, scene.gaussians.object_id)
     assert overlap[3] > 0.85 and overlap[1] > 0.85
     assert not (found.gaussians.object_id[scene.gaussians.object_id == 2] > 0).any()
+
+
+def test_outlines_are_cut_in_views_that_are_drawn_on_the_device(device, monkeypatch):
+    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])
+    monkeypatch.setattr(clicks, "REDUCTIONS", ())
+    asked, drawn = [], []
+
+    class Recorded(ViewFootprint):
+        @classmethod
+        def of(cls, scene: Scene, view: int) -> ViewFootprint:
+            drawn.append(scene.gaussians.means.device.type)
+            return ViewFootprint.of(scene, view)
+
+    def refine(scene: Scene, ids: torch.Tensor, *, device: torch.device) -> torch.Tensor:
+        asked.append(device.type)
+        return view_outlines.refine_outlines(scene, ids, device=device)
+
+    monkeypatch.setattr(view_outlines, "ViewFootprint", Recorded)
+    monkeypatch.setattr(clicks, "refine_outlines", refine)
+    scene = three_apart(side=0.56)
+    found = segment(unlabelled(scene), SegmentOptions(points=(at(scene, 2, 0, "egg"),), device=device))
+    assert asked == [device] and set(drawn) == {device}
+    assert found.gaussians.object_id.device.type == "cpu"  # as all of the scene
 
 
 def test_points_of_one_name_are_on_one_object(monkeypatch):

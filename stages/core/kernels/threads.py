@@ -2,7 +2,8 @@
 
 A Warp launch on the CPU runs on the calling thread and releases Python's lock, so several threads launch the parts of
 a computation in parallel. The calling thread takes part: it runs the tasks that no pool thread has claimed yet. When
-other processes occupy the cores, it does all of the work instead of waiting for the pool.
+other processes occupy the cores, it does all of the work instead of waiting for the pool. CUDA has a current GPU for
+each thread, at first GPU 0: pool threads take that of the caller, which is what "cuda" means in a task.
 
 PyTorch's operations use OpenMP, whose threads wait passively (see `stages`). Waking them takes longer than most
 operations of a small model: 40,000 products take 6 us on one thread and 72 us on two (AMD EPYC). Within
@@ -18,12 +19,19 @@ from contextlib import contextmanager
 from functools import cache, partial
 from queue import SimpleQueue
 from threading import Barrier, Thread
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 Task = Callable[[], None]
-Batch = tuple[deque[Task], "SimpleQueue[BaseException | None]"]  # tasks to claim; one entry for each task that ended
+
+
+class TaskBatch(NamedTuple):
+    """Tasks that threads run together."""
+
+    tasks: deque[Task]  # to claim
+    ended: SimpleQueue[BaseException | None]  # one entry for each task that ended
+    gpu: int | None  # the current one of the caller; None before CUDA is used
 
 
 def run_parallel(tasks: Sequence[Task]) -> None:
@@ -35,12 +43,13 @@ def run_parallel(tasks: Sequence[Task]) -> None:
     _run(tasks, _helpers(max(0, torch.get_num_threads() - 1))[: len(tasks) - 1])
 
 
-def _run(tasks: Sequence[Task], helpers: list[SimpleQueue[Batch]]) -> None:
-    batch: Batch = deque(tasks), SimpleQueue()
+def _run(tasks: Sequence[Task], helpers: list[SimpleQueue[TaskBatch]]) -> None:
+    gpu = torch.cuda.current_device() if torch.cuda.is_initialized() else None
+    batch = TaskBatch(deque(tasks), SimpleQueue(), gpu)
     for inbox in helpers:
         inbox.put(batch)
     _work(batch)
-    errors = [error for _ in tasks if (error := batch[1].get()) is not None]
+    errors = [error for _ in tasks if (error := batch.ended.get()) is not None]
     if errors:
         raise errors[0]
 
@@ -65,12 +74,11 @@ def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[A
     return results
 
 
-def _work(batch: Batch) -> None:
+def _work(batch: TaskBatch) -> None:
     """Claim and run tasks until none is left."""
-    tasks, ended = batch
-    while tasks:
+    while batch.tasks:
         try:
-            task = tasks.popleft()
+            task = batch.tasks.popleft()
         except IndexError:  # another thread was faster
             return
         error = None
@@ -78,14 +86,14 @@ def _work(batch: Batch) -> None:
             task()
         except BaseException as raised:  # passed on to the caller of run_parallel
             error = raised
-        ended.put(error)
+        batch.ended.put(error)
 
 
 @cache
-def _helpers(count: int) -> list[SimpleQueue[Batch]]:
+def _helpers(count: int) -> list[SimpleQueue[TaskBatch]]:
     """Inboxes of that many threads, which live as long as the process."""
     threads, started = torch.get_num_threads(), Barrier(count + 1)
-    inboxes: list[SimpleQueue[Batch]] = [SimpleQueue() for _ in range(count)]
+    inboxes: list[SimpleQueue[TaskBatch]] = [SimpleQueue() for _ in range(count)]
     for inbox in inboxes:
         Thread(target=_serve, args=(inbox, started), name="kernels", daemon=True).start()
     started.wait()
@@ -93,11 +101,14 @@ def _helpers(count: int) -> list[SimpleQueue[Batch]]:
     return inboxes
 
 
-def _serve(inbox: SimpleQueue[Batch], started: Barrier) -> None:
+def _serve(inbox: SimpleQueue[TaskBatch], started: Barrier) -> None:
     torch.set_num_threads(1)  # of this thread
     started.wait()
     while True:
-        _work(inbox.get())
+        batch = inbox.get()
+        if batch.gpu is not None:
+            torch.cuda.set_device(batch.gpu)
+        _work(batch)
 
 
 _thread_count: list[int] = []  # outside of the current `small_operations`, if there is one

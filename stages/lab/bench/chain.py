@@ -120,12 +120,12 @@ def timed(call: Callable[[], object], device: str) -> tuple[float, float | None]
 def _busy_samples(device: str) -> Iterator[list[int]]:
     """Utilisation of the GPU [%], read in a thread; stays empty on a CPU and without NVIDIA's management library."""
     samples: list[int] = []
-    done = threading.Event()
+    done, gpu = threading.Event(), None if device == "cpu" else torch.cuda.current_device()  # of this thread
 
     def watch() -> None:
         while not done.wait(SAMPLE_SECONDS):
             try:
-                samples.append(torch.cuda.utilization(device))
+                samples.append(torch.cuda.utilization(gpu))
             except (ImportError, ModuleNotFoundError, RuntimeError):
                 return
 

@@ -28,8 +28,10 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
     """Write all missing files, as generate.run does, with one task per group and one GPU per task if there are any.
 
     `address` is "local", "auto" or the address of a cluster. Raises MissingPackage without Ray, and InputError when
-    the cluster does not answer, or has no GPU though --device cuda was given.
+    the cluster does not answer, or has no GPU though --device cuda was given, and for --device cuda:N.
     """
+    if options.device.startswith("cuda:"):
+        raise InputError(f"--device {options.device}: Ray gives each task a GPU of its own; give --device cuda")
     try:
         import ray
     except ImportError as error:

@@ -5,7 +5,9 @@ import time
 
 import pytest
 import torch
+import warp as wp
 
+from stages.core.backends import pick_device
 from stages.core.kernels.threads import large_operation, parallel_map, run_parallel, small_operations
 
 
@@ -41,6 +43,40 @@ def test_tasks_have_the_gradient_mode_of_the_caller(threads, mode):
             return torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
         assert parallel_map(task, range(threads)) == [expected] * threads
+
+
+def test_tasks_have_the_current_gpu_of_the_caller(threads, monkeypatch):
+    """With a stand-in for CUDA, in which each thread begins with GPU 0 too."""
+    own = threading.local()
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: getattr(own, "gpu", 0))
+    monkeypatch.setattr(torch.cuda, "set_device", lambda gpu: setattr(own, "gpu", gpu))
+    barrier = threading.Barrier(threads, timeout=10)  # so that every thread takes a task
+
+    def task(_) -> int:
+        barrier.wait()
+        return torch.cuda.current_device()
+
+    for gpu in (1, 0):
+        torch.cuda.set_device(gpu)
+        assert parallel_map(task, range(threads)) == [gpu] * threads
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two NVIDIA GPUs")
+def test_tasks_compute_on_the_gpu_of_the_caller(threads):
+    barrier = threading.Barrier(threads, timeout=10)
+
+    def task(_) -> tuple[int, str]:
+        barrier.wait()
+        return torch.zeros(1, device="cuda").device.index, str(wp.get_device("cuda"))
+
+    try:
+        for gpu in (1, 0):
+            assert pick_device(f"cuda:{gpu}") == "cuda"
+            assert parallel_map(task, range(threads)) == [(gpu, f"cuda:{gpu}")] * threads
+    finally:
+        torch.cuda.set_device(0)
 
 
 def test_an_exception_is_raised_after_all_tasks_have_ended(threads):

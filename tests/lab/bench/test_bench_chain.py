@@ -1,8 +1,10 @@
 """The chain's benchmark, with small functions in the place of the stages."""
 
 import json
+import threading
 
 import pytest
+import torch
 
 from stages.core.errors import InputError
 from stages.core.scene.scene_ply import write_scene
@@ -27,6 +29,24 @@ def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
     facts = json.loads((tmp_path / "chain.json").read_text())
     assert facts["objects"] == [2, 2] and len(facts["runs"]) == 2 and facts["commands"]["refine"] == 1.5
     assert facts["sha256"][0]["scene.ply"] == facts["sha256"][1]["scene.ply"]
+
+
+def test_utilisation_is_that_of_the_current_gpu(monkeypatch):
+    """The thread that reads it has a current GPU of its own, which is GPU 0."""
+    caller, asked, twice = threading.get_ident(), [], threading.Event()
+
+    def utilization(gpu: int) -> int:
+        asked.append(gpu)
+        if len(asked) > 1:
+            twice.set()
+        return 50
+
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: int(threading.get_ident() == caller))
+    monkeypatch.setattr(torch.cuda, "utilization", utilization)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(chain, "SAMPLE_SECONDS", 0.01)
+    assert chain.timed(lambda: twice.wait(10), "cuda")[1] == 0.5
+    assert set(asked) == {1}
 
 
 @pytest.mark.parametrize("refine", [True, False])

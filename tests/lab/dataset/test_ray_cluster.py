@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.core.errors import MissingPackage
+from stages.core.errors import InputError, MissingPackage
 from stages.lab.dataset import generate, ray_cluster
 from tests.lab.small_world import OPTIONS, shrink
 
@@ -17,6 +17,11 @@ def test_missing_ray_is_reported_with_its_install_command(monkeypatch, tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingPackage, match=r"pip install 'ngff\[ray\]'"):
         ray_cluster.run(tmp_path, MOTIONS, "local")
+
+
+def test_the_number_of_a_gpu_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--device cuda:1: Ray gives each task a GPU of its own; give --device cuda"):
+        ray_cluster.run(tmp_path, replace(MOTIONS, device="cuda:1"), "local")
 
 
 @pytest.mark.slow

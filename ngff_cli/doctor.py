@@ -21,10 +21,16 @@ NETWORKS = {  # command that runs a published network: its row
     **{f"segment --backend {name}": (name, row) for name, row in SEGMENTERS.items() if row.find_weights},
     **{f"refine --completer {name}": (name, row) for name, row in COMPLETERS.items() if row.find_weights},
 }
-OPTIONAL = {  # package: (what needs it, the extra that installs it)
+OPTIONAL = {  # package of pyproject.toml's extras: (what needs it, the extra that installs it)
     "huggingface_hub": ("--download", "hub"),
-    "gsplat": ("ngff-lab bench appearance and raster", "bench"),
     **{row.package: (user, row.extra) for user, (_, row) in NETWORKS.items() if row.package},
+    "usd-core": ("ngff render -o x.usdc", "usd"),
+    "cma": ("ngff-lab fit", "fit"),
+    "trimesh": ("meshes, as of ngff-lab objects --from", "mesh"),
+    "pillow": ("textures of meshes", "mesh"),
+    "ray": ("ngff-lab dataset --ray", "ray"),
+    "pytorch-optimizer": ("ngff-lab train --optimizer soap", "train"),
+    "gsplat": ("ngff-lab bench appearance and raster", "bench"),
 }
 
 

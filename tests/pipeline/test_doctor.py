@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -13,6 +14,8 @@ from ngff_cli.lab import app
 from stages.core.kernels import interop
 from stages.core.models.matching import weights as matching_weights
 from tests.pipeline.test_documentation import unknown_part
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def by_subject() -> dict[str, doctor.Finding]:
@@ -73,6 +76,18 @@ def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
     (tmp_path / "aliked-n16rot.pth").write_bytes(bytes(10**8))
     found = by_subject()
     assert found["sam2"].ok and found["aliked-lightglue"].ok
+
+
+def test_optional_packages_are_those_of_the_extras():
+    """Each package with an extra that has it, and each extra but that for development."""
+    project = pytest.importorskip("tomllib").loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = {name: {re.match(r"[\w-]+", line)[0] for line in lines}
+              for name, lines in project["optional-dependencies"].items() if name != "dev"}  # fmt: skip
+    assert set(doctor.OPTIONAL) == set.union(*extras.values())
+    assert {extra for _, extra in doctor.OPTIONAL.values()} == set(extras)
+    assert not [name for name, (_, extra) in doctor.OPTIONAL.items() if name not in extras[extra]]
+    found = by_subject()
+    assert not [name for name in doctor.OPTIONAL if name not in found]
 
 
 def test_remedies_are_commands_that_exist(monkeypatch, tmp_path):

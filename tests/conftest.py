@@ -13,9 +13,11 @@ from typer import testing
 
 from stages.core.errors import MissingPackage
 from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.physics.skinning import Skinning
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.trajectory import Binding, Keypoints
 from tests import calls, made
 from tests.browser import chromium, open_page  # noqa: F401 -- fixtures
 from tests.chat_server import chat_server  # noqa: F401 -- a fixture
@@ -147,6 +149,11 @@ def random_gaussians(n: int, seed: int = 0, degree: int = 0, size: float = 0.05)
         0.3 * torch.randn(n, (degree + 1) ** 2, 3, generator=rng),
         torch.zeros(n, dtype=torch.int64),
     )
+
+
+def deform(gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: torch.Tensor) -> Gaussians:
+    """The Gaussians of one frame."""
+    return Skinning(gaussians, binding, keypoints)(positions)
 
 
 def ring(count: int = 6, size: int = 64, target: float = 0.0) -> Cameras:

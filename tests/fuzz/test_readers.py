@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -16,9 +17,21 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote, text
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.fuzz import campaign
-from stages.lab.fuzz.cases import GOOD, Examples, result_of, run_here
+from stages.lab.fuzz.cases import GOOD, Examples, quiet, result_of
 from stages.lab.fuzz.examples import example_scene, write_trajectory
 from stages.lab.fuzz.kinds import KINDS, Kind
+
+
+def run_here(folder: Path, count: int, seed: int = 0) -> tuple[Counter, list[str]]:
+    """The first `count` cases of a seed in this process: how many of each kind and result, and the failures."""
+    counts, failures, examples = Counter(), [], Examples(folder)
+    with quiet():
+        for number in range(count):
+            kind, result, why = examples.run(seed, number)
+            counts[kind.name, result] += 1
+            if result not in GOOD:
+                failures.append(f"{kind.name}, case {number} of seed {seed}: {result}: {why}")
+    return counts, failures
 
 
 @pytest.mark.parametrize("count", [300, pytest.param(1000, marks=pytest.mark.slow)])

@@ -15,12 +15,12 @@ import torch
 from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
-from stages.core.physics.skinning import deform
 from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 from stages.render.splat_files import _y_up
 from stages.render.stage import run
+from tests.conftest import deform
 from tests.core.player.test_player import motion_of, world
 from tests.render.conftest import render_options
 

@@ -338,7 +338,7 @@ def test_hostile_clients_are_closed_and_others_go_on(server):
             raw.sendall(b"\x00" * 100_000)
         say(good, do="step")
         assert heard(server) == [{"do": "step"}]
-    assert eventually(lambda: server.clients == 0)
+    assert eventually(lambda: len(server._clients) == 0)
 
 
 def test_a_message_that_is_too_long_ends_the_connection_before_it_is_read(server):
@@ -364,8 +364,8 @@ def test_two_hundred_connections_leave_nothing_behind(server):
 
     with ExitStack() as stack, ThreadPoolExecutor(16) as pool:
         connected = [stack.enter_context(c) for c in pool.map(attempt, range(200)) if c is not None]
-        assert len(connected) >= 1 and server.clients <= MAX_CLIENTS
-    assert eventually(lambda: server.clients == 0)
+        assert len(connected) >= 1 and len(server._clients) <= MAX_CLIENTS
+    assert eventually(lambda: len(server._clients) == 0)
     if before:
         assert eventually(lambda: len(os.listdir("/proc/self/fd")) <= before)
     server.messages()

@@ -140,15 +140,6 @@ def _captured(work: Callable[[], None]) -> Callable[[], None]:
 
 
 @torch.no_grad()
-def rollout(
-    model: Dynamics, initial: InitialConditions, steps: int, dt: float = FRAME, external: ExternalForces | None = None
-) -> Float[Tensor, "b t o n 3"]:
-    """`model.rollout` by a TimeStepper: keypoints [m] in `steps` frames, the first at time 0; 0 where padded."""
-    out = record_frames(TimeStepper(model, initial, dt, external), steps)
-    return out.masked_fill_(~initial.valid[:, None, ..., None], 0.0)
-
-
-@torch.no_grad()
 def record_frames(stepper: TimeStepper, steps: int) -> Float[Tensor, "b t o n 3"]:
     """Keypoints [m] now and after each of steps - 1 further steps; undefined where padded."""
     b, o, n, _ = stepper.points.shape

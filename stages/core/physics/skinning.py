@@ -70,11 +70,6 @@ class Skinning:
         return fit_rotations(self.rest, self.rest + u, self._body)
 
 
-def deform(gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: Float[Tensor, "p 3"]) -> Gaussians:
-    """The Gaussians of one frame; for several frames use Skinning."""
-    return Skinning(gaussians, binding, keypoints)(positions)
-
-
 def fit_rotations(
     rest: Float[Tensor, "p 3"], positions: Float[Tensor, "p 3"], body: Int[Tensor, "p"]
 ) -> Float[Tensor, "o 3 3"]:

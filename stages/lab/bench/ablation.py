@@ -7,7 +7,6 @@ options are kept.
 from __future__ import annotations
 
 import json
-import logging
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -31,7 +30,6 @@ from stages.lab.training.options import TrainOptions
 from stages.lab.training.state import TrainingState
 from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, validate
 
-log = logging.getLogger(__name__)
 METRICS = ("RMSE", "FPE", "R")
 VALIDATION_CHECKS = 6  # validations in one training; the best weights are scored
 

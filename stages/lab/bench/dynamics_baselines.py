@@ -6,7 +6,6 @@ Each is a function from scenes to keypoints in all of their frames (`Predict`).
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,6 @@ from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
-log = logging.getLogger(__name__)
 Predict = Callable[[KeypointMotions], Float[Tensor, "s t o n 3"]]
 # E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
 VLM_MATERIALS = {

@@ -32,8 +32,6 @@ from stages.core.scene.scene_ply import read_scene
 from stages.lab.bench.common import machine, write_json
 from stages.lab.bench.scene_options import ReconstructBenchOptions
 
-log = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True)
 class PoseError:

@@ -8,7 +8,6 @@ nodes a velocity that points outwards loses its normal component, and a tenth of
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,6 @@ from stages.core.scene.files import replacing
 from stages.core.scene.npz import read_npz
 from stages.lab.bench.motion_options import ReplayOptions
 
-log = logging.getLogger(__name__)
 RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
                     "gravity", "rpic_damping"}  # fmt: skip
 SCALARS = ("nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "rpic_damping")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import json
-import logging
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
@@ -30,7 +29,6 @@ from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
 from stages.lab.bench.speed_options import RolloutBenchOptions
 
-log = logging.getLogger(__name__)
 SCENE_OBJECTS = 3
 PEER = "ngff-paper, step by step"  # the baseline, as published
 

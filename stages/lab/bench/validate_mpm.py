@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from stages.core.kernels.mpm.constitutive import SAND, VON_MISES, sand_slope
+from stages.core.kernels.mpm.constitutive import SAND, sand_slope
 from stages.core.physics.mpm import solver as mpm
 
 OPEN_BOX = mpm.Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
@@ -177,22 +177,6 @@ def total_momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tens
     x, v, C, m = (t.double() for t in (p.x, p.v, p.C, p.mass))
     spin = dx**2 / 4 * torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
     return (m[:, None] * v).sum(0), (m[:, None] * (torch.linalg.cross(x, v) + spin)).sum(0)
-
-
-def yield_stress(strength: float) -> tuple[float, float]:
-    """Largest von Mises stress in a metal block compressed by a tenth, and its yield strength [Pa]."""
-    dx = 0.05
-    p = particle_block((0.2, 0.2, 0.2), dx / 2, nu=0.3, viscosity=50.0, model=VON_MISES, plastic=(strength, 0.0, 0.0))
-    p.held[p.x[:, 2] < dx] = 1
-    p.held[p.x[:, 2] > 0.2 - dx] = 1
-    p.v[p.x[:, 2] > 0.2 - dx, 2] = -0.1
-    solver = mpm.Solver(p, OPEN_BOX, dx)
-    for _ in range(10):
-        advance(solver, 0.02)
-    now = subset(solver.particles, p.held == 0)
-    S = torch.linalg.svdvals(now.F).log()
-    stress = 2 * now.stiffness[:, :1] * (S - S.mean(1, keepdim=True))
-    return float(math.sqrt(1.5) * stress.norm(dim=1).max()), strength
 
 
 def figure(out: Path) -> None:

@@ -12,7 +12,6 @@ import random
 import shutil
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,15 +90,3 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         logging.disable(logging.NOTSET)
-
-
-def run_here(folder: Path, count: int, seed: int = 0) -> tuple[Counter, list[str]]:
-    """The first `count` cases of a seed in this process: how many of each kind and result, and the failures."""
-    counts, failures, examples = Counter(), [], Examples(folder)
-    with quiet():
-        for number in range(count):
-            kind, result, why = examples.run(seed, number)
-            counts[kind.name, result] += 1
-            if result not in GOOD:
-                failures.append(f"{kind.name}, case {number} of seed {seed}: {result}: {why}")
-    return counts, failures

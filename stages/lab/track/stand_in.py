@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.backends import load
@@ -26,12 +26,10 @@ from stages.core.physics.state import FrameState
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
-from stages.core.scene.images import VideoWriter, write_jpeg, write_labels
+from stages.core.scene.images import VideoWriter, write_jpeg
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.assets.toys import falling_toys
-from stages.lab.track.poses import Poses
-from stages.lab.track.synthesis import Synthesiser
 from stages.simulate.options import ENGINES, SimulateOptions
 
 SUBSTEPS = 6  # simulated steps in a frame
@@ -184,29 +182,6 @@ def _picture(stand_in: StandIn, camera: int, step: int) -> Float[Tensor, "h w 3"
     if step // SUBSTEPS in stand_in.hidden:
         image = _covered(image, parts[1], V[0], K[0])
     return image
-
-
-def true_labels(stand_in: StandIn, camera: int) -> Iterator[Int[Tensor, "h w"]]:
-    """The label image of each frame of a film: ids of the objects, 0 elsewhere."""
-    o, scene, states = stand_in.options, stand_in.scene, stand_in.states
-    synthesiser, start = Synthesiser(scene, "cpu"), stand_in.starts[scene.cameras.names[camera]]
-    size = scene.cameras.sizes[camera].tolist()
-    view, rest = synthesiser.camera(scene.cameras.viewmats[camera], scene.cameras.Ks[camera], *size), synthesiser.rest
-    ids = torch.tensor([0, *(thing.id for thing in scene.objects)])
-    for k in range(round(start) + o.frames + AFTER):
-        state = states[min(max(round((k - start) * SUBSTEPS), 0), len(states) - 1)]
-        R = matrix(state.rotation)
-        centre = (R @ (rest - states[0].com)[..., None])[..., 0] + state.com
-        yield ids[synthesiser.draw(view, Poses(R, centre)).label + 1]
-
-
-def write_masks(stand_in: StandIn, folder: Path) -> None:
-    """A folder of label images for each film."""
-    for camera, name in enumerate(stand_in.scene.cameras.names):
-        images = folder / Path(name).stem
-        images.mkdir(parents=True, exist_ok=True)
-        for k, labels in enumerate(true_labels(stand_in, camera)):
-            write_labels(images / f"{k:05d}.png", labels)
 
 
 def _covered(image: Tensor, thing: Gaussians, V: Tensor, K: Tensor) -> Float[Tensor, "h w 3"]:

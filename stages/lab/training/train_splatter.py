@@ -8,7 +8,6 @@ with the photos, and rendered depth with the depth of the Gaussians. Source: Li 
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -36,7 +35,6 @@ from stages.lab.training.options import SplatterOptions
 from stages.lab.training.splatter_data import WHITE, PosedViews, read_training_scenes
 from stages.reconstruct.depth import unproject
 
-log = logging.getLogger(__name__)
 SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM (the rest is L1) and of the relative depth error
 CHECKS = 10  # validations in a run
 TRAINED_MODULES = ("feature_decoder", "feature_head")

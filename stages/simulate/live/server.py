@@ -23,7 +23,6 @@ from http import HTTPStatus
 from stages.core.errors import InputError, MissingPackage
 from stages.simulate.live.messages import MAX_BYTES, BadMessage, parse_message
 
-log = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MAX_CLIENTS = 16
 MAX_ERRORS = 10  # wrong messages after which a client is disconnected
@@ -75,11 +74,6 @@ class LiveServer:
     def __exit__(self, *_) -> None:
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(timeout=5)
-
-    @property
-    def clients(self) -> int:
-        """Number of connected pages."""
-        return len(self._clients)
 
     def messages(self, wait: float = 0.0) -> list[dict]:
         """Messages of the controlling client since the last call; waits up to `wait` [s] for one."""

@@ -4,12 +4,33 @@ import math
 
 import pytest
 import torch
+import warp as wp
 
+from stages.core.kernels.interop import device_of, launch, view, with_arrays
 from stages.core.kernels.mpm import constitutive as materials
-from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, update_materials
+from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, material_update
+from stages.core.kernels.mpm.transfers import ParticleArrays
 from tests.conftest import DEVICES
 
 MU, LAM = 4e4, 6e4
+
+
+@wp.kernel(enable_backward=False)
+def _update(rows: ParticleArrays, dt: float, tau: wp.array[wp.mat33]):
+    i = wp.tid()
+    out = material_update(int(rows.model[i]), rows.F[i], rows.stiffness[i], rows.plastic[i], rows.state[i], dt)
+    rows.F[i] = out.F
+    tau[i] = out.tau
+    rows.state[i] = out.state
+
+
+def update_materials(model, F, stiffness, plastic, state, dt: float = 0.0) -> tuple[torch.Tensor, ...]:
+    """Elastic F (p, 3, 3), Kirchhoff stress (p, 3, 3) [Pa] and state (p) of particles after `material_update`."""
+    F, state, tau = F.clone(), state.clone(), torch.empty_like(F)
+    tensors = {"model": model, "F": F, "stiffness": stiffness, "plastic": plastic, "state": state}
+    rows = with_arrays(ParticleArrays(), tensors)
+    launch(_update, len(F), [rows, dt, view(tau, wp.mat33)], device=device_of(F))
+    return F, tau, state
 
 
 def respond(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 0.0, dt: float = 0.0, device="cpu"):

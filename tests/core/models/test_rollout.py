@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from stages.core.models.checkpoints import build
+from stages.core.models.dynamics import Dynamics
 from stages.core.models.external_forces import ExternalForces
-from stages.core.models.rollout import TimeStepper, record_frames, rollout
+from stages.core.models.initial_conditions import InitialConditions
+from stages.core.models.rollout import TimeStepper, record_frames
 from tests.conftest import DEVICES
 from tests.core.models.dynamics_fixtures import (
     SMALL_CONFIGS,
@@ -16,6 +18,12 @@ from tests.core.models.dynamics_fixtures import (
 )
 
 CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+
+
+def rollout(model: Dynamics, initial: InitialConditions, steps: int, external: ExternalForces | None = None):
+    """`model.rollout` by a TimeStepper."""
+    out = record_frames(TimeStepper(model, initial, external=external), steps)
+    return out.masked_fill(~initial.valid[:, None, ..., None], 0.0)
 
 
 @pytest.mark.parametrize("device", ["cpu", *([CUDA] if "cuda" in DEVICES else [])])

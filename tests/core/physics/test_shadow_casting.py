@@ -11,10 +11,10 @@ from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.lighting import estimate_light
 from stages.core.physics.occluders import _VIEWS
 from stages.core.physics.shadow_casting import find_shadows
-from stages.core.physics.skinning import deform
 from stages.core.raster.rasterise import rasterise
 from stages.core.raster.shadows import OVERHEAD, Light
 from stages.core.scene.scene import Scene
+from tests.conftest import deform
 from tests.core.raster.lit_world import (
     BACKGROUND,
     HALF,

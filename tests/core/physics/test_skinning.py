@@ -8,11 +8,11 @@ import torch
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import covariance, matrix
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints, farthest_points, nearest_weights
-from stages.core.physics.skinning import Skinning, deform, fit_rotations, object_rotations
+from stages.core.physics.skinning import Skinning, fit_rotations, object_rotations
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Binding, Keypoints
-from tests.conftest import random_gaussians
+from tests.conftest import deform, random_gaussians
 
 TURN = matrix(torch.tensor([0.3, 0.5, -0.2, 0.7]))
 

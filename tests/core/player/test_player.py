@@ -12,13 +12,12 @@ from stages.core.geometry.rotations import matrix
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.occluders import make_occluders
 from stages.core.physics.shadow_casting import ShadowCaster
-from stages.core.physics.skinning import deform
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.trajectory import Keypoints
 from tests.browser import until
-from tests.conftest import random_gaussians, two_balls_scene
+from tests.conftest import deform, random_gaussians, two_balls_scene
 from tests.core.raster.lit_world import LIGHT, MOVED, REST, lit_scene, moved_points
 
 PIXELS = """async (view) => {

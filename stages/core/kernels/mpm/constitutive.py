@@ -25,8 +25,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.mpm.transfers import ParticleArrays
-
 NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
 MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
 MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
@@ -175,32 +173,6 @@ def material_update(
         t = 2.0 * mu * e + wp.vec3(trace, trace, trace)
     out.tau = U * wp.diag(t) * wp.transpose(U)
     return out
-
-
-@wp.kernel(enable_backward=False)
-def _update(rows: ParticleArrays, dt: float, tau: wp.array[wp.mat33]):
-    i = wp.tid()
-    out = material_update(int(rows.model[i]), rows.F[i], rows.stiffness[i], rows.plastic[i], rows.state[i], dt)
-    rows.F[i] = out.F
-    tau[i] = out.tau
-    rows.state[i] = out.state
-
-
-def update_materials(
-    model: Tensor, F: Tensor, stiffness: Tensor, plastic: Tensor, state: Tensor, dt: float = 0.0
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Elastic F (p, 3, 3), Kirchhoff stress (p, 3, 3) [Pa] and state (p) of particles after `material_update`.
-
-    model (p) int8; F (p, 3, 3): trial; stiffness (p, 3): mu, lambda [Pa], eta (not used here); plastic (p, 3); state
-    (p); dt [s].
-    """
-    from stages.core.kernels.interop import device_of, launch, view, with_arrays
-
-    F, state, tau = F.clone(), state.clone(), torch.empty_like(F)
-    tensors = {"model": model, "F": F, "stiffness": stiffness, "plastic": plastic, "state": state}
-    rows = with_arrays(ParticleArrays(), tensors)
-    launch(_update, len(F), [rows, dt, view(tau, wp.mat33)], device=device_of(F))
-    return F, tau, state
 
 
 def sand_slope(degrees: float) -> float:

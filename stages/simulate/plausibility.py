@@ -8,7 +8,8 @@ below the floor at rest, where bodies are cut off.
 creep: speed of an object in the last quarter of the time, if it is slow in all of that quarter [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest increase of the mechanical energy of all objects above that at the start, or after the last force,
-relative to the energy that was converted. The inertia is that of the filled bodies, since keypoints are on surfaces.
+relative to the energy that was converted: what was lost, or the kinetic energy, if that is more, since in free fall or
+free space next to nothing is lost. The inertia is that of the filled bodies, since keypoints are on surfaces.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class PlausibilityMonitor:
         self._put_into: dict[tuple[int, int], float] = {}  # depth in the first frame, of rows
         self._spread = np.zeros(count)
         self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # of the last quarter
-        self._energy: list[float] = []
+        self._energy: list[tuple[float, float]] = []  # kinetic and potential
         self._second_moment = cache(self._second_moment_of)
         self._before: tuple[list[np.ndarray], np.ndarray, np.ndarray] | None = None
 
@@ -137,19 +138,19 @@ class PlausibilityMonitor:
         body = self._surface(row)
         return np.cov(body.voxels.T, bias=True) + body.h**2 / 12 * np.eye(3)
 
-    def _mechanical_energy(self, now: tuple, before: tuple, mass: np.ndarray) -> float:
+    def _mechanical_energy(self, now: tuple, before: tuple, mass: np.ndarray) -> tuple[float, float]:
         """Kinetic and potential energy per unit of mass between two frames [units^2 / s^2], each given by the keypoints
         of the objects, their centres of mass and their rotations. What keypoints move beside these is deformation.
         """
         points, com, R = ([a - b for a, b in zip(x, y, strict=True)] for x, y in zip(now, before, strict=True))
-        energy = self._g * (now[1] + before[1])[:, 2] / 2
+        kinetic, potential = np.zeros(len(com)), self._g * (now[1] + before[1])[:, 2] / 2
         for i, moved in enumerate(points):
             if len(moved):
                 turning = np.trace(R[i] @ self._second_moment(i) @ R[i].T)
                 rigid = com[i] + (self._rest[i] - self._origin[i]) @ R[i].T
                 square = com[i] @ com[i] + turning + ((moved - rigid) ** 2).sum(1).mean()
-                energy[i] += square / (2 * self._options.dt**2)
-        return float(mass @ energy / mass.sum())
+                kinetic[i] = square / (2 * self._options.dt**2)
+        return float(mass @ kinetic / mass.sum()), float(mass @ potential / mass.sum())
 
     def result(self) -> dict:
         """The measures: of each object by its id, and of the whole scene."""
@@ -168,10 +169,11 @@ class PlausibilityMonitor:
     def _energy_gain(self) -> float:
         ends = [f.end for f in self._prompts.forces] + [c.start for c in self._prompts.changes]
         first = 0 if not ends else min(max(ends) / self._options.dt, math.inf)
-        energy = np.array(self._energy[math.ceil(first) :] if math.isfinite(first) else [])
-        if len(energy) < 2:
+        both = np.array(self._energy[math.ceil(first) :] if math.isfinite(first) else [])
+        if len(both) < 2:
             return 0.0
-        converted = max(energy[0] - energy.min(), 1e-3 * abs(self._g) * float(self._size.min()), 1e-12)
+        energy, kinetic = both.sum(1), both[:, 0]
+        converted = max(energy[0] - energy.min(), kinetic.max(), 1e-3 * abs(self._g) * float(self._size.min()), 1e-12)
         return float(max(energy.max() - energy[0], 0.0) / converted)
 
     def _warn_of_edges(self) -> None:

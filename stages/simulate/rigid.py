@@ -23,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
+from stages.core.kernels.depth_lookup import turned
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.table_outline import TableOutline
 from stages.core.physics.forces import Force, ForcePrompts
@@ -171,6 +172,8 @@ class _World:
         for row, b in enumerate(bodies):
             self._restitution[self.model.geom_bodyid == row + 1] = restitution(b.material.loss)
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
+        axes = matrix(torch.from_numpy(self.model.body_iquat[1:][self._free])).numpy()
+        self._to_axes = axes.transpose(0, 2, 1)  # of inertia, from the body's frame
         for k, i in enumerate(self._free):
             self.data.qvel[FALLING * k : FALLING * k + 3] = velocity[i].numpy() * self.units.time / size
         self.set_forces(prompts.forces, prompts.pinned)
@@ -320,12 +323,23 @@ class _World:
         if found:
             self._overlaps.subtract(data, self._resting.fixed, found)
         mujoco.mj_fwdVelocity(model, data)
+        self._centre_gyroscopic_torques()
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         if data.nefc:
             find_contact_forces(mujoco, model, data, self._restitution)
         else:
             mujoco.mj_fwdConstraint(model, data)
+
+    def _centre_gyroscopic_torques(self) -> None:
+        """Take them at the angular velocities in the middle of the substep: MuJoCo takes those at its start, which
+        gives energy to bodies that tumble.
+        """
+        spin, torque = (x.reshape(-1, FALLING)[:, 3:] for x in (self.data.qvel, self.data.qfrc_bias))
+        inertia = self.model.body_inertia[1:][self._free]
+        local = turned(self._to_axes, spin)  # both are in the frame of the body
+        local -= self.model.opt.timestep / 2 * np.cross(local, inertia * local) / inertia
+        torque[:] = turned(self._to_axes.transpose(0, 2, 1), np.cross(local, inertia * local))
 
     def _apply_forces(self, acting: list, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.geometry.rotations import matrix
 from stages.core.physics import solid_surface
 from stages.core.physics.materials import MATERIALS
 from stages.core.scene.gaussians import concatenate
@@ -381,6 +382,24 @@ def test_friction_adds_no_energy_to_tumbling_bodies(tmp_path):
     energy = energy_between_frames(t, 0.004)
     least = torch.cummin(energy.unfold(0, 3, 1).amax(1), 0).values
     assert float((energy[2:] - least).max()) < 0.01 * float(energy[0] - energy.min())
+
+
+def test_a_body_that_tumbles_in_free_space_keeps_its_energy(tmp_path):
+    """About its middle axis of inertia, so that it turns over again and again, for 3 s at 10 rad/s."""
+    brick, dt = box((0.3, 0.2, 0.1), 0.02).moved((0.0, 0.0, 1.0)), 0.02
+    moments = torch.tensor([0.2**2 + 0.1**2, 0.3**2 + 0.1**2, 0.3**2 + 0.2**2]) / 12  # per mass
+    torque = 500 * 0.3 * 0.2 * 0.1 / dt * moments * torch.tensor([0.5, 10.0, 0.0])
+    push = "object=1 from=0 to={} torque={},{},{}".format(dt, *torque.tolist())
+    t = roll(tmp_path, brick, gravity=0.0, dt=dt, steps=152, force=(push,))
+    R = matrix(t.rotation[1:, 0].double())
+    assert float(R[:, 1, 1].min()) < -0.9  # it turned over
+    turn = R[:-1].mT @ R[1:]  # of a frame, about an axis in the body
+    axis = torch.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+    sine = axis.norm(dim=1, keepdim=True) / 2
+    spin = axis / (2 * sine) * sine.asin() / dt  # less than a right angle
+    energy = spin.square() @ moments.double()
+    assert float(energy.max() / energy.min()) < 1.03
+    assert float(energy[0]) == pytest.approx(float(moments[1]) * 100 + float(moments[0]) * 0.25, rel=0.1)
 
 
 def test_a_dropped_body_that_is_not_convex_rests_when_its_rebounds_are_over(tmp_path):

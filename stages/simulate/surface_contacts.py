@@ -315,8 +315,9 @@ def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
     added.geom1[new], added.geom2[new], added.geom[new] = one, two, geoms
     added.dist[new], added.pos[new] = -excess, x
     added.frame[new] = _frames(normal)
-    # as MuJoCo combines those of two geometries
-    added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
+    # as MuJoCo combines those of two geometries: without any friction its elliptic cones have no normal force either
+    friction = np.maximum(model.geom_friction[one], model.geom_friction[two]).clip(mujoco.mjMINMU)
+    added.friction[new] = friction[:, [0, 0, 1, 2, 2]]
     added.solimp[new] = model.geom_solimp[one]
 
 

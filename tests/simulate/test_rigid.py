@@ -205,6 +205,15 @@ def test_a_body_that_is_not_convex_slides_by_v2_over_2_mu_g(tmp_path):
     assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
 
 
+def test_a_body_that_is_not_convex_slides_on_without_friction(tmp_path):
+    """On the floor, and a box on it."""
+    low = cross().moved((0, 0, 0.025))
+    t = roll(tmp_path, low, cube(0.04, 0, 0.05), velocity=("object=1 1,0,0", "object=2 1,0,0"), friction=0.0, steps=20)
+    moved = t.com[-1] - t.com[0]
+    assert moved[:, 0].tolist() == pytest.approx([0.38, 0.38], rel=0.01)
+    assert moved[:, 2].tolist() == pytest.approx([0.0, 0.0], abs=2e-3)
+
+
 @pytest.mark.usefixtures("usual_bodies")
 def test_bodies_that_are_not_convex_rebound_by_their_loss_factor(tmp_path):
     """A cross that falls flat onto a pinned one; speeds are those of parabolas before and after the impact."""

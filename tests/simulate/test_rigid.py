@@ -411,6 +411,15 @@ def test_a_body_that_tumbles_in_free_space_keeps_its_energy(tmp_path):
     assert float(energy[0]) == pytest.approx(float(moments[1]) * 100 + float(moments[0]) * 0.25, rel=0.1)
 
 
+def test_a_body_that_spins_by_two_radians_in_a_substep_keeps_its_axis(tmp_path):
+    """As slender ones do that roll; it also turns at 1 rad/s about another axis, and so nutates by 3 degrees."""
+    bar, dt = box((0.3, 0.1, 0.1), 0.01).moved((0.0, 0.0, 1.0)), 0.02
+    torque = 500 * 0.3 * 0.1 * 0.1 / 12 / dt * np.array([100 * 0.02, 1 * 0.1])
+    push = f"object=1 from=0 to={dt} torque={torque[0]},{torque[1]},0"
+    t = roll(tmp_path, bar, gravity=0.0, dt=dt, steps=60, force=(push,))
+    assert float(matrix(t.rotation[:, 0])[:, 0, 0].min()) > math.cos(math.radians(8))
+
+
 def test_a_dropped_body_that_is_not_convex_rests_when_its_rebounds_are_over(tmp_path):
     """Rebounds of restitution e after a fall of time T last T (1 + e) / (1 - e) in all."""
     e, fall = math.exp(-math.pi * 0.4 / 2), math.sqrt(2 * 0.1 / G)

@@ -48,11 +48,11 @@ class PlausibilityMonitor:
         self._rest = [keypoints.rest[rows].double().numpy() for rows in self._rows]
         self._few = [slice(None, None, -(-max(len(r), 1) // MAX_CHECKED_KEYPOINTS)) for r in self._rest]
         self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest]).clip(1e-9)
-        self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._floor = options.floor if options.floor is not None else scene.floor
         self._table = table_of(scene, options) if options.engine == "rigid" else None
         self._left = np.zeros(len(scene.objects), bool)  # the table, over its edge
         self._surface, self._outside = cache(self._surface_of), cache(self._outside_of)
+        self._height = cache(self._height_of)
         self._at_rest = cache(self._rest_depth)
         count = len(scene.objects)
         self.penetration, self._partner = np.zeros(count), [""] * count
@@ -93,7 +93,7 @@ class PlausibilityMonitor:
                 below, seen = (self._floor - p[:, 2] - self._outside(a) for p in (points[a], self._rest[a]))
                 if self._table is not None:
                     below = np.minimum(below, np.maximum(-self._table.beyond(points[a]), 0.0))
-                self._record(a, float(below.max() - max(seen.max(), 0.0)), self._height[a], "the floor")
+                self._record(a, float(below.max() - max(seen.max(), 0.0)), self._height(a), "the floor")
         near = ((low[:, None] < high) & (low < high[:, None])).all(-1) & (moved[:, None] | moved)
         for a, b in zip(*np.nonzero(near), strict=True):
             if a != b:
@@ -102,7 +102,7 @@ class PlausibilityMonitor:
                 if self._frames == 1:  # where the prompts put it
                     self._put_into[a, b] = depth
                 depth -= max(self._at_rest(a, b), self._put_into.get((a, b), 0.0))
-                smaller = min(self._height[a], self._height[b])
+                smaller = min(self._height(a), self._height(b))
                 for i, other in ((a, b), (b, a)):
                     o = self._scene.objects[other]
                     self._record(i, depth, smaller, f"object {o.id} ({o.name})")
@@ -128,6 +128,10 @@ class PlausibilityMonitor:
 
     def _surface_of(self, row: int) -> SolidSurface:
         return solid_surface(self._scene, self._scene.objects[row].id, self._options.seed)
+
+    def _height_of(self, row: int) -> float:
+        """Of an object at rest; at least a voxel of its body, since that of a flat sheet may be 0."""
+        return max(float(np.ptp(self._rest[row][:, 2])), self._surface(row).h)
 
     def _outside_of(self, row: int) -> np.ndarray:
         """How far the keypoints (k,) of an object are outside its own body."""
@@ -194,7 +198,7 @@ class PlausibilityMonitor:
             "mpm" if self._options.engine == "rigid" else "rigid, or a higher --quality")  # fmt: skip
         for a, b in sorted({(min(pair), max(pair)) for pair in self._put_into}):
             depth = max(self._put_into.get(p, 0.0) - self._at_rest(*p) for p in ((a, b), (b, a)))
-            share = depth / min(self._height[a], self._height[b])
+            share = depth / min(self._height(a), self._height(b))
             if share > BOUNDS["penetration"]:
                 one, into = self._scene.objects[a], self._scene.objects[b]
                 log.warning("--lift puts object %d (%s) and object %d (%s) into each other by %.0f %% of the smaller "

@@ -67,6 +67,16 @@ def test_depth_of_penetration(scene, caplog):
     assert below["objects"]["2"]["penetration"] == pytest.approx(0.25, abs=0.01)
 
 
+def test_depth_in_the_height_of_a_flat_sheet_is_relative_to_a_voxel_of_it(scene):
+    """The lower cube, and a sheet on it that sinks in by .01."""
+    upper = scene.gaussians.object_id == 2
+    means = scene.gaussians.means.clone()
+    means[upper, 2] = 0.2
+    sheet = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    found, monitor = measured(sheet, ramp(0.0, 0.0, -0.01))
+    assert found["objects"]["2"]["penetration"] == pytest.approx(0.01 / monitor._surface(1).h, rel=0.3)
+
+
 def test_depth_of_penetration_without_a_floor(scene):
     found, _ = measured(replace(scene, floor=None), ramp(0.0, 0.0, -0.03))
     assert found["objects"]["2"]["penetration"] == pytest.approx(0.15, abs=0.03)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
-from stages.core.geometry.extremes import extreme_rows
+from stages.core.geometry.extremes import extreme_rows, fibonacci
 from stages.core.geometry.surface_faces import FACE_COSINE, NEAR, nearest_points, surface_faces
 from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
@@ -28,6 +28,7 @@ from stages.core.scene.scene import Scene
 from stages.simulate.model_units import ModelUnits
 
 SAMPLES = 512  # points of a body that are looked up in others, about a twentieth of its size apart
+BALL_DIRECTIONS = 2000  # in which a ball is looked up in others at the start: to .001 radii
 BLOCK = 1024  # points of which the distances from all faces stay in the cache
 ON_EDGE = 1e-3  # difference of distances from two faces below which a point is on the edge between them [voxels]
 
@@ -141,13 +142,16 @@ def _grid(shape: _Shape, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], l
 
 
 def _overlaps(surfaces: BodySurfaces, com: Float[Tensor, "o 3"]) -> Float[Tensor, "o o"]:
-    """How deep the samples of each body are in each other one [m]."""
-    o, k, _ = surfaces.samples.shape
-    out = torch.zeros(o, o)
-    at = com[:, None] + surfaces.samples
-    for b in range(o):
-        depth, _ = surfaces.look_up(torch.full((o * k,), b), (at - com[b]).flatten(0, 1))
-        depth = torch.where(surfaces.near >= 0, depth.view(o, k), 0.0)
-        out[:, b] = depth.amax(1).clamp_min(0)
-    out.fill_diagonal_(0.0)
-    return out
+    """How deep each body is in each other one [m]: of balls their surfaces, as in contacts, of others their samples."""
+    centre, radius = com + surfaces.centre, surfaces.radius
+    directions = torch.from_numpy(fibonacci(BALL_DIRECTIONS)).float()
+    out = torch.zeros(len(com), len(com))
+    for a in range(len(com)):
+        ball = radius[a] > 0
+        x = centre[a] + radius[a] * directions if ball else com[a] + surfaces.samples[a, surfaces.near[a] >= 0]
+        body = torch.arange(len(com)).repeat_interleave(len(x))
+        depth, _ = surfaces.look_up(body, x.repeat(len(com), 1) - com[body])
+        out[a] = depth.view(len(com), -1).amax(1).clamp_min(0)
+    both = (radius > 0) & (radius[:, None] > 0)
+    exact = (radius + radius[:, None] - torch.cdist(centre, centre)).clamp_min(0)
+    return torch.where(both, exact, out).fill_diagonal_(0.0)

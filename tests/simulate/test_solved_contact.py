@@ -1,16 +1,23 @@
 """Solved contacts of the learned field against textbook physics, through the stage, and when they are taken."""
 
+import math
+
 import pytest
+import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.shapes import ellipsoid, to_gaussians
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import measure
 from stages.simulate.engine_choice import with_engine
 from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene
+from tests.simulate.motion import roll_out
 
 SOLVED = PhysicsBenchOptions(contact="solved")
 
@@ -50,3 +57,13 @@ def test_is_the_default_for_stiff_bodies():
     thrown = ForcePrompts(velocity={2: (0.5, 0.0, 0.0)})
     options = SimulateOptions(engine="ngff", **soft)
     assert with_engine(options, scene, choose_keypoints(scene, 32), thrown).contact == "solved"
+
+
+def test_balls_that_overlap_at_the_start_are_not_pushed_apart():
+    """Side by side on the floor, by a twentieth of their radius."""
+    surfaces = [ellipsoid((0.1,) * 3, 2000).moved((x, 0.0, 0.1)) for x in (0.0, 0.195)]
+    grey = torch.full((2000, 3), 0.5)
+    parts = [to_gaussians(s, grey[: len(s.points)], i + 1, widest=math.inf) for i, s in enumerate(surfaces)]
+    scene = Scene(concatenate(parts), (SceneObject(1, "left"), SceneObject(2, "right")), None, 0.0)
+    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=16, keypoints=64, device="cpu"))
+    assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3

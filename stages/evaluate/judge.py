@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.models.chat_completions import ChatEndpoint, InvalidReply, image_part, json_object
-from stages.core.scene.files import replacing, sha256
+from stages.core.scene.files import check_output, replacing, sha256
 from stages.core.scene.formats import VIDEO_SUFFIXES
 from stages.core.scene.images import sample_frames
 from stages.core.scene.schema import parse_json, quote
@@ -161,8 +161,7 @@ class _Record:
     """OUT.replies.json: the usable reply to each question, by its number, and what the questions depend on."""
 
     def __init__(self, out: Path, films: Sequence[Path], endpoint: ChatEndpoint, options: EvaluateOptions):
-        if not out.parent.is_dir():  # said before anything is asked
-            raise InputError(f"{out}: there is no folder {out.parent}; create it first")
+        check_output(out)  # said before anything is asked
         self.path = out.with_suffix(".replies.json")
         settings = {"url": endpoint.url, "model": endpoint.model, "repeats": options.repeats, "seed": options.seed,
                     "films_per_question": options.films_per_question, "frames": FRAMES, "longest": LONGEST,

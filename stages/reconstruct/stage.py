@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import ngff_version, provenance, seconds_since, sha256
+from stages.core.scene.files import check_output, ngff_version, provenance, seconds_since, sha256
 from stages.core.scene.scene_ply import write_scene
 from stages.reconstruct.options import BACKENDS, SINGLE_PHOTO_BACKENDS, ReconstructOptions
 from stages.reconstruct.photo_reader import read_photos
@@ -53,6 +53,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
     began, backend = time.monotonic(), choose(BACKENDS, "--backend", options.backend)
+    check_output(Path(out), "scene")
     if options.sequence:
         from stages.reconstruct.filmed_sequence import read_sequence  # noqa: PLC0415 -- most runs read photos
 

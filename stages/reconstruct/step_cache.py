@@ -15,7 +15,6 @@ from typing import TypeVar
 
 import torch
 
-from stages.core.errors import InputError
 from stages.core.scene.files import replacing, save_tensors
 
 log = logging.getLogger(__name__)
@@ -43,10 +42,8 @@ class StepCache:
 
     @classmethod
     def for_output(cls, out: Path, key: str, resume: bool) -> StepCache:
-        """A cache in a hidden folder next to the output file; InputError where its folder is missing."""
+        """A cache in a hidden folder next to the output file."""
         out = Path(out)
-        if not out.parent.is_dir():
-            raise InputError(f"{out}: there is no folder {out.parent}; create it first")
         return cls(out.with_name(f".steps-{out.name}"), key, resume)
 
     @contextmanager

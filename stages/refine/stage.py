@@ -42,7 +42,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
-    check_output(Path(out))
+    check_output(Path(out), "scene")
     refined = refine(whole, options)
     facts = {**provenance("refine", [scene], options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))

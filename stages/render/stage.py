@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stages.core.backends import load, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance, replacing
+from stages.core.scene.files import check_output, provenance, replacing
 from stages.render.animation import open_animation
 from stages.render.background import open_background
 from stages.render.options import OUTPUT_FORMATS, RenderOptions
@@ -41,8 +41,12 @@ def run(
         raise InputError(f"--playable: only a page (-o {page}) computes motion, not {out.name}")
     if out.is_dir():
         out = out / "frame.ply"
-    facts = _writer(out)(out, renderer)
+    write = _writer(out)
+    check_output(out)
     used = [Path(p) for p in (*sources, options.background, options.view) if p is not None and Path(p).is_file()]
+    if out.exists() and any(out.samefile(path) for path in used):
+        raise InputError(f"{out}: is a file that is rendered; name another to write")
+    facts = write(out, renderer)
     scenes = [animation.scene.provenance for animation in animations]
     facts = {**provenance("render", used, options), **facts, "scene": scenes[0] if len(scenes) == 1 else scenes}
     with replacing(out.with_name(f"{out.name}.json")) as part:

@@ -27,7 +27,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     began, segment = time.monotonic(), choose(BACKENDS, "--backend", options.chosen)
     pick_device(options.device)  # raises for an absent GPU; only networks use one
     whole = read_scene(scene)
-    check_output(Path(out))
+    check_output(Path(out), "scene")
     labelled = rename_objects(segment(whole, options), options)
     reference = parse_object_scale(options.scale_reference)
     labelled = reference.applied(labelled) if reference else labelled

@@ -47,7 +47,7 @@ def run(
     if options.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     pick_device(options.device)  # a wrong name is an error with every engine
-    check_output(Path(out))
+    check_output(Path(out), "trajectory")
     world = with_objects(read_scene(scene), scene, options.seed, options.device)
     tell_of_unseen_sides(world, Path(scene))
     stored = forces.ForcePrompts()

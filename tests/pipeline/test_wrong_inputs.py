@@ -1,5 +1,6 @@
 """Errors of the command line: one line on stderr, exit status 2, and no incomplete file."""
 
+import os
 import signal
 from importlib import import_module
 from pathlib import Path
@@ -9,7 +10,6 @@ import pytest
 import torch
 
 from ngff_cli.options import run_command_line
-from stages.core.errors import InputError
 from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.scene_ply import write_scene
@@ -55,6 +55,7 @@ WRONG = [
     "evaluate good.h5 --against good.ply",
     "evaluate good.ply --against absent.ply",
     "evaluate good.h5 --against good.h5 -o nowhere/m.json",
+    "evaluate good.h5 --against good.h5 -o m.json --report nowhere/r.html",
 ]
 
 
@@ -110,13 +111,46 @@ def work(*_, **__):
     pytest.fail("the work has begun")
 
 
-@pytest.mark.parametrize(("stage", "name", "value"), [
-    ("segment", "choose", lambda *_: work), ("refine", "refine", work), ("simulate", "with_objects", work),
+WORK = {  # of each stage: function that is called after the output is checked, and what it is replaced by
+    "reconstruct": ("read_photos", work), "segment": ("choose", lambda *_: work), "refine": ("refine", work),
+    "simulate": ("with_objects", work), "render": ("load", lambda *_: work), "evaluate": ("choose", lambda *_: work),
+}  # fmt: skip
+SOURCES = {"evaluate": "good.h5 --against good.h5"}  # of the other stages good.ply
+
+
+@pytest.mark.parametrize(("out", "message"), [("nowhere/o{}", "no folder"), ("empty", "is a folder"),
+                                              ("", "is a folder"), (".", "is a folder")])  # fmt: skip
+@pytest.mark.parametrize("stage", WORK)
+def test_an_output_that_cannot_be_written_is_reported_before_the_work(stage, out, message, monkeypatch):
+    if stage == "render" and message == "is a folder":
+        pytest.skip("a folder gets PLY files")
+    monkeypatch.setattr(f"stages.{stage}.stage.{WORK[stage][0]}", WORK[stage][1])
+    suffix = {"simulate": ".h5", "evaluate": ".json"}.get(stage, ".ply")
+    words = [stage, *SOURCES.get(stage, "good.ply").split(), "-o", out.format(suffix)]
+    status, _, err = call(*words)
+    assert status == 2 and message in err and "Traceback" not in err
+
+
+@pytest.mark.parametrize("line", [
+    "reconstruct damaged -o good.h5", "segment good.ply -o good.h5", "refine good.ply -o good.h5",
+    "simulate good.ply -o good.ply", "evaluate good.h5 --against good.h5 -o good.h5", "segment good.ply -o labelled",
 ])  # fmt: skip
-def test_a_missing_folder_is_reported_before_the_work(input_files, stage, name, value, monkeypatch):
-    monkeypatch.setattr(f"stages.{stage}.stage.{name}", value)
-    with pytest.raises(InputError, match="no folder"):
-        import_module(f"stages.{stage}.stage").run(input_files / "good.ply", input_files / "nowhere/o.ply")
+def test_outputs_have_the_suffix_of_their_format_so_that_other_files_are_not_replaced(input_files, line):
+    before = {name: (input_files / name).read_bytes() for name in ("good.ply", "good.h5")}
+    assert "suffix" in fails_cleanly(line)
+    assert before == {name: (input_files / name).read_bytes() for name in before}
+
+
+def test_a_file_is_not_rendered_over_itself(input_files):
+    before = (input_files / "good.ply").read_bytes()
+    assert "is a file that is rendered; name another" in fails_cleanly("render good.ply -o good.ply")
+    assert (input_files / "good.ply").read_bytes() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="permissions are those of POSIX")
+def test_a_folder_that_cannot_be_written_to_is_reported_before_the_work(input_files, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write everywhere
+    assert "o.ply: its folder cannot be written to" in fails_cleanly("segment good.ply -o o.ply")
 
 
 FULL = [

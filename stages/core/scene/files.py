@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.core.errors import InputError
+from stages.core.scene.formats import format_of
 from stages.core.scene.schema import read_json, reason
 
 KEPT_OF_NAME = 50  # characters of a file's name in that of its temporary file; names have up to 255 bytes
@@ -22,14 +23,23 @@ _count = itertools.count()
 _swept: set[Path] = set()  # folders in which this process has looked for files of killed processes
 
 
-def check_output(path: Path) -> None:
-    """Raises InputError where `path` is a folder or a device, or its folder is missing: to be said before long work."""
+def check_output(path: Path, *kinds: str) -> None:
+    """Whether a file can be written, to be said before long work: InputError where not.
+
+    Where `path` is a folder or a device, its folder is missing or cannot be written to, or its suffix is not of a
+    format that holds one of the `kinds` of data (formats.py), if any are given: the next stage could not read it, and
+    it might be a file of another kind.
+    """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name the file to write")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no file, but a device or a pipe, which cannot be replaced; name another")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: its folder cannot be written to; change its permissions, or name another")
+    if kinds:
+        format_of(path, *kinds, writable=True)
 
 
 @contextmanager

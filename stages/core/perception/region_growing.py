@@ -25,6 +25,8 @@ MAX_GROWTH_STEPS = 12  # steps of `radius` that an object may grow along Gaussia
 def cielab_colours(g: Gaussians) -> Float[Tensor, "n 3"]:
     """Base colours (degree 0 of the spherical harmonics) in CIELAB."""
     rgb = (g.sh[:, 0] * C0 + 0.5).nan_to_num(0.5).clamp(0, 1).numpy().astype(np.float32)
+    if not len(rgb):  # which OpenCV refuses
+        return torch.zeros(0, 3)
     return torch.from_numpy(cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3))
 
 

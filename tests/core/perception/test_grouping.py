@@ -109,6 +109,17 @@ def test_large_gaussian_is_labelled_only_inside_an_object():
     assert whole.object_id[len(shell) :][:3].tolist() == [1, 0, 0]
 
 
+def test_objects_grow_where_no_gaussian_is_on_the_supporting_plane():
+    scene = three_apart()
+    support = find_support(scene)
+    above = replace(support, coefficients=support.coefficients + torch.tensor([0.3, 0, 0, 0, 0, 0]))
+    strays = replace(scene.gaussians[scene.gaussians.object_id == 1][:20], object_id=torch.zeros(20).long())
+    higher = replace(strays, means=strays.means + torch.tensor([0.0, 0.0, 0.6]))
+    body = replace(higher, means=higher.means + 0.001, object_id=torch.ones(20).long())
+    assert (above.heights(scene.gaussians.means).abs() > above.tolerance).all()
+    assert (grow_objects(concatenate([body, higher]), above, 0.02).object_id == 1).all()
+
+
 def test_supporting_plane_is_found_without_a_floor():
     scene = replace(three_apart(tilt=0.02), floor=None)
     support = find_support(scene)

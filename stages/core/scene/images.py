@@ -23,6 +23,7 @@ from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.image_header import MAX_PIXELS, read_image_header
 
 log = logging.getLogger(__name__)
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our errors say the same in one line
 IGNORE_LABEL = 255  # pixels of label images that are not evaluated
 MAX_IMAGE_BYTES = 1 << 30  # of an image file
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
@@ -65,10 +66,19 @@ def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
 
 
 def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
-    """A label image: one integer per pixel (8 bit, or 16 where `max_bits` allows). InputError for several channels."""
+    """A label image: one integer per pixel (8 bit, or 16 where `max_bits` allows).
+
+    InputError for several channels, and for JPEG, whose compression makes other numbers at the outlines.
+    """
     pixels = _decode(path, cv2.IMREAD_UNCHANGED, "a label image")
+    with Path(path).open("rb") as file:
+        lossy = file.read(2) == b"\xff\xd8"
+    if lossy:
+        raise InputError(f"{path}: is a JPEG, whose compression changes the numbers; save the label image as PNG")
     if pixels.ndim != 2:
         raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
+    if pixels.dtype.kind != "u":
+        raise InputError(f"{path}: has values of type {pixels.dtype}; save the label image with 8 bits, as PNG")
     if 8 * pixels.itemsize > max_bits:
         raise InputError(f"{path}: has {8 * pixels.itemsize} bits per pixel; save the label image with {max_bits}")
     return torch.from_numpy(pixels.astype(np.int64))
@@ -102,6 +112,8 @@ def _decode(path: Path, flags: int, what: str = "an image") -> np.ndarray:
         raise InputError(f"{path}: is damaged; convert it to JPEG or PNG") from error
     if pixels is None:
         raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # TIFF may hold others
+        raise InputError(f"{path}: has values of type {pixels.dtype}; convert it to 8 bits, as PNG")
     return pixels
 
 

@@ -177,6 +177,26 @@ def test_label_images_have_one_channel_and_a_bounded_depth(tmp_path):
         read_labels(tmp_path / "b.png", max_bits=8)
 
 
+def test_label_images_are_not_compressed_with_losses(tmp_path):
+    labels = np.kron(np.array([[0, 1], [2, 3]], np.uint8), np.ones((20, 20), np.uint8))
+    cv2.imwrite(str(tmp_path / "a.jpg"), labels)
+    (tmp_path / "a.jpg").rename(tmp_path / "a.png")  # what it is called does not matter
+    with pytest.raises(InputError, match="a.png: is a JPEG, .* as PNG"):
+        read_labels(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32, np.float64])
+def test_images_of_other_types_are_refused_in_one_line(tmp_path, dtype, capfd):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.full((8, 9), -3, dtype))
+    for read in (read_image, read_labels):
+        with pytest.raises(InputError, match="a.tif: .* (as|or) PNG$"):
+            read(tmp_path / "a.tif")
+    cv2.imwrite(str(tmp_path / "b.tif"), np.full((8, 9), 0.5, np.float32))
+    with pytest.raises(InputError, match="b.tif: has values of type float32"):
+        read_labels(tmp_path / "b.tif")
+    assert capfd.readouterr().err == ""  # OpenCV would log there
+
+
 def test_folders_without_photos_and_long_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="no photos in it; these formats are read: .*.png"):
         list_photos(tmp_path)

@@ -36,8 +36,8 @@ def reason(error: Exception) -> str:
 
 def number(value: object, what: str, low: Bound = -LARGEST, high: Bound = LARGEST) -> float:
     """A finite number between two bounds; ValueError, with `what` it is, for anything else."""
-    kinds = (int, float, np.integer, np.floating)
-    if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+    value = value.item() if isinstance(value, np.generic) else value  # also for the message
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not a number from {low:g} to {high:g}")
     return float(value)
 
@@ -63,9 +63,9 @@ def text(value: object, what: str) -> str:
     return quote(value, 200)
 
 
-def numbered(values: dict, what: str) -> dict[int, object]:
-    """The values by their keys, converted to integers; ValueError for other keys and for duplicates."""
-    wrong = [key for key in values if not (key.isascii() and key.isdecimal() and len(key) < 10)]
+def numbered(values: object, what: str) -> dict[int, object]:
+    """The values of a JSON object by their keys, converted to integers; ValueError for other keys and duplicates."""
+    wrong = [key for key in table(values, "it") if not (key.isascii() and key.isdecimal() and len(key) < 10)]
     if wrong:
         raise ValueError(f"{what} is {quote(repr(wrong[0]), 40)}, not a whole number")
     found = {whole(int(key), what): value for key, value in values.items()}
@@ -103,9 +103,12 @@ def table(value: object, what: str) -> dict:
 
 
 def parse_json(data: str, finite: bool = True) -> object:
-    """The value of a JSON text of bounded depth; `finite` rejects NaN, infinities and integers beyond 64 bits."""
+    """The value of a JSON text of bounded depth; ValueError for an object with two values of one key.
+
+    `finite` rejects NaN, infinities and integers beyond 64 bits.
+    """
     try:
-        value = json.loads(data, **(FINITE if finite else {}))
+        value = json.loads(data, object_pairs_hook=_object, **(FINITE if finite else {}))
     except RecursionError:
         raise ValueError(f"it is nested more than {MAX_JSON_DEPTH} deep") from None
     level = [value]
@@ -118,13 +121,21 @@ def parse_json(data: str, finite: bool = True) -> object:
 
 
 def read_json(path: Path) -> object:
-    """The value of a JSON file (UTF-8) of bounded size and depth."""
+    """The value of a JSON file (UTF-8, which Windows begins with a mark) of bounded size and depth."""
     if Path(path).exists() and not Path(path).is_file():  # reading a pipe would block
         raise ValueError("it is not a file")
     size = Path(path).stat().st_size
     if size > MAX_JSON_BYTES:
         raise ValueError(f"it has {size >> 20} MB; at most {MAX_JSON_BYTES >> 20} are read")
-    return parse_json(Path(path).read_text(encoding="utf-8"))
+    return parse_json(Path(path).read_text(encoding="utf-8-sig"))
+
+
+def _object(pairs: list[tuple[str, object]]) -> dict:
+    found = dict(pairs)
+    if len(found) < len(pairs):  # Python would silently take the last
+        twice = next(key for i, (key, _) in enumerate(pairs) if key in dict(pairs[:i]))
+        raise ValueError(f"{quote(repr(twice), 40)} is there twice")
+    return found
 
 
 def _finite(digits: str) -> float:

@@ -44,7 +44,7 @@ VALUES = [  # check, value, result; None: refused
     (table, {"a": 1}, {"a": 1}), (table, [], None), (table, None, None),
     (numbered, {"1": "a", "20": "b"}, {1: "a", 20: "b"}), (numbered, {"1": 0, "01": 0}, None),
     (numbered, {"x": 0}, None), (numbered, {"-1": 0}, None), (numbered, {"٣": 0}, None), (numbered, {"1.0": 0}, None),
-    (numbered, {"9999999999": 0}, None),
+    (numbered, {"9999999999": 0}, None), (number, np.float64(1.01 * LARGEST), None), (number, np.bool_(True), None),
 ]  # fmt: skip
 
 
@@ -101,6 +101,26 @@ def test_json_files_are_bounded_files(tmp_path, monkeypatch):
     monkeypatch.setattr(schema, "MAX_JSON_BYTES", 10)
     with pytest.raises(ValueError, match="at most 0 are read"):
         read_json(tmp_path / "a.json")
+
+
+def test_json_files_may_begin_with_the_mark_of_windows(tmp_path):
+    (tmp_path / "a.json").write_text('{"ü": 1}', encoding="utf-8-sig")
+    assert read_json(tmp_path / "a.json") == {"ü": 1}
+
+
+def test_json_objects_have_one_value_of_each_key():
+    for data in ('{"1": "duck", "2": "cup", "1": "bowl"}', '[{"a": {"1": 0, "1": 0}}]'):
+        with pytest.raises(ValueError, match="^'1' is there twice$"):
+            parse_json(data)
+    assert parse_json('{"a": {"1": 0}, "b": {"1": 0}}') == {"a": {"1": 0}, "b": {"1": 0}}
+
+
+def test_messages_show_plain_values():
+    with pytest.raises(ValueError, match="^dt is -1.0, not a number"):
+        number(np.float64(-1), "dt", 0)
+    for value in (None, ["a"]):
+        with pytest.raises(ValueError, match="^it is .*, not a JSON object$"):
+            numbered(value, "a label")
 
 
 def test_json_files_hold_what_is_expected(tmp_path):

@@ -23,6 +23,7 @@ from stages.core.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
 MARGIN = 6  # nodes between the particles and the faces of the grid: stencils, and the elastic rebound of what was hit
+MAX_SUBSTEPS = 200_000  # of a frame: minutes, where hundreds are usual
 FRAMES = 10  # frames for which a new grid has room at the present speed
 
 
@@ -56,14 +57,31 @@ class MovingGrid:
             raise InputError(f"--engine mpm: {error}; {remedy}, use a coarser --quality or another --engine") from error
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
-        """Advance by `duration` [s] under these accelerations [m/s^2], on a new grid where the old one is too small."""
+        """Advance by `duration` [s] under these accelerations [m/s^2], on a new grid where the old one is too small.
+
+        Raises InputError as `substeps` does, and mpm.Diverged.
+        """
         self._make_room(duration, acceleration)
-        self.solver.advance(duration, acceleration)
+        self.solver.advance(duration, acceleration, self.substeps(duration, acceleration))
+
+    def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
+        """Number of substeps in `duration` [s]; InputError for more than MAX_SUBSTEPS, which would take minutes."""
+        count = self.solver.substeps(duration, acceleration)
+        if count > MAX_SUBSTEPS:
+            raise InputError(
+                f"--engine mpm: a frame of {duration:g} s takes {count:.2g} substeps, as the grid spacing is "
+                f"{self._dx:.2g} m and speeds reach {self._speed(duration, acceleration):.2g} m/s; check the scale of "
+                "the scene and what acts on it, or give a smaller --dt or another --engine"
+            )
+        return count
+
+    def _speed(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> float:
+        """Bound of the speed of particles at the end of `duration` [m/s]."""
+        return float(self.solver.rows["v"].norm(dim=1).max()) + duration * float(acceleration.norm(dim=1).max())
 
     def _make_room(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
         """Move the grid if a particle could come near one of its faces, except the floor, within a frame."""
-        rows, dx = self.solver.rows, self._dx
-        x, speed = rows["x"], float(rows["v"].norm(dim=1).max()) + duration * float(acceleration.norm(dim=1).max())
+        x, speed, dx = self.solver.rows["x"], self._speed(duration, acceleration), self._dx
         if not math.isfinite(speed) or self._fixed:
             return
         low, high = x.amin(0).tolist(), x.amax(0).tolist()

@@ -66,7 +66,7 @@ def rollout(
     ids = [o.id for o in scene.objects]
     attachment = _attach(scene, keypoints, setup.bodies)
     gravity = _gravity(particles, options)
-    substeps = grid.solver.substeps(options.dt, gravity)
+    substeps = grid.substeps(options.dt, gravity)
     log.info(
         "%d particles, grid spacing %.3g m, %d nodes, substep %.3g s (%d per frame; more for fast motion)",
         len(particles), dx, grid.solver.grid.count, options.dt / substeps, substeps,

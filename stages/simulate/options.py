@@ -18,6 +18,8 @@ class Engine:
     weights: str | None = None  # model whose weights it needs (see stages/core/models/checkpoints.py)
 
 
+MAX_FRAMES = 10**9  # as many as --live asks for
+MAX_HEIGHT = 1e9  # of the floor [scene units], as in files
 AUTO = "auto"  # see engine_choice.py
 STANDARD_GRAVITY = 9.81  # [m/s^2]
 ENGINES = {
@@ -98,19 +100,18 @@ class SimulateOptions:
             raise InputError(f"--contact {self.contact}: only for --engine ngff, not for {self.engine}")
         if self.quality not in QUALITIES:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
-        if self.steps < 1:
-            raise InputError(f"--steps {self.steps}: at least 1 frame is needed")
+        if not 1 <= self.steps <= MAX_FRAMES:
+            raise InputError(f"--steps {self.steps}: give at least 1 frame, at most {MAX_FRAMES}")
         if not 1e-5 <= self.dt <= 1:
             raise InputError(f"--dt {self.dt}: the time between frames must be between 0.00001 and 1 s")
         if not (math.isfinite(self.gravity) and abs(self.gravity) < 1e4):
             raise InputError(f"--gravity {self.gravity}: give metres per second squared, such as 9.81")
         if self.friction is not None and not 0 <= self.friction < 100:
-            raise InputError(f"--friction {self.friction}: must be 0 or more")
+            raise InputError(f"--friction {self.friction}: must be 0 or more, and below 100")
         if self.keypoints is not None and not 8 <= self.keypoints <= 100_000:
             raise InputError(f"--keypoints {self.keypoints}: must be 8 to 100000")
-        if self.floor is not None and not math.isfinite(self.floor):
-            raise InputError(f"--floor {self.floor}: must be a finite height")
-
+        if self.floor is not None and not abs(self.floor) <= MAX_HEIGHT:
+            raise InputError(f"--floor {self.floor}: must be a height from {-MAX_HEIGHT:g} to {MAX_HEIGHT:g}")
         if not 0 <= self.port < 65536:
             raise InputError(f"--port {self.port}: must be 0 (any free one) to 65535")
         if not self.live and (self.port or not self.browser):

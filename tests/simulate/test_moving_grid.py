@@ -76,3 +76,14 @@ def test_a_grid_for_many_bodies_begins_near_them_and_one_too_large_is_an_error(d
     for fixed, remedy in ((True, "smaller --box"), (False, "fewer objects")):
         with pytest.raises(InputError, match=f"--engine mpm: .*too large; .*{remedy}.*--quality"):
             MovingGrid(particles, wide, DX, device, bodies, fixed=fixed)
+
+
+def test_frames_of_too_many_substeps_are_an_error_that_says_why(device):
+    """Those of a scene whose scale is wrong, and of a force that accelerates to nonsense."""
+    particles, box = cube((0.0, 0.0, 0.5), (0.0, 0.0, 0.0)), Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2))
+    bodies = GridBodies(torch.zeros(27, dtype=torch.int64), OBJECTS[:1])
+    grid = MovingGrid(particles, box, DX, device, bodies, fixed=True)
+    for call in (grid.substeps, grid.advance):
+        with pytest.raises(InputError, match=r"takes .*e\+\d+ substeps, .* 0.05 m and speeds reach 2e\+13 m/s"):
+            call(DT, torch.full((27, 3), 1e15 / 3**0.5))
+    assert 1 <= grid.substeps(DT, torch.zeros(27, 3)) < 200

@@ -192,11 +192,11 @@ def test_overlapping_objects_do_not_explode():
 def test_divergence_names_object_time_and_remedy_and_keeps_the_frames(file, monkeypatch):
     advance = engine.mpm.Solver.advance
 
-    def fails_later(self, duration, acceleration):
+    def fails_later(self, duration, acceleration, substeps):
         self.calls = getattr(self, "calls", 0) + 1
         if self.calls == 3:
             raise engine.mpm.Diverged(len(acceleration) - 1)
-        return advance(self, duration, acceleration)
+        return advance(self, duration, acceleration, substeps)
 
     monkeypatch.setattr(engine.mpm.Solver, "advance", fails_later)
     with pytest.raises(InputError, match=r"object 2 \(thing\).* at 0.04 s.*--quality"):

@@ -132,7 +132,8 @@ def _force(text: str, objects: Sequence[SceneObject]) -> Force:
 
 def _checked(force: Force, where: str) -> Force:
     if not 0 <= force.start < force.end:
-        raise InputError(f"{where}: acts from {force.start} s to {force.end} s; the end must come after the start")
+        what = "the end must come after the start" if force.start >= 0 else "the simulation begins at 0 s"
+        raise InputError(f"{where}: acts from {force.start} s to {force.end} s; {what}")
     return force
 
 

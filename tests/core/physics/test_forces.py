@@ -60,6 +60,7 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     ({"force": ["object=2 force=0,0,1 until=3"]}, "'until' is not a known key"),
     ({"force": ["object=2 force=0,0,1 from=x"]}, "'x' is not a number"),
     ({"force": ["object=2 force=0,0,1 from=0.3 to=0.1"]}, "the end must come after"),
+    ({"force": ["object=2 force=0,0,1 from=-1 to=1"]}, "the simulation begins at 0 s"),
     ({"force": ["object=9 force=0,0,1"]}, "'9' is not an object of this scene; there are: 1 \\(duck\\), 2 \\(phone\\)"),
     ({"pin": ["cow"]}, "--pin 'cow'"),
     ({"velocity": ["1 0,0,2"]}, 'write "object=1 0,0,2"'),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import re
@@ -36,8 +37,7 @@ def read_scene(path: Path) -> Scene:
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
-        _check_counts(path)
-        ply = PlyData.read(str(path))
+        ply = PlyData.read(_ascii_header(path))
     except (PlyParseError, ValueError, OverflowError, MemoryError, IndexError) as error:
         why = reason(error)
         raise InputError(f"{path}: is not a readable PLY file ({why}); {EXPECTED} is expected") from error
@@ -55,16 +55,25 @@ def read_scene(path: Path) -> Scene:
     return _with_header(path, gaussians, ply.comments)
 
 
-def _check_counts(path: Path) -> None:
-    """ValueError where the file is shorter than its header declares."""
+def _ascii_header(path: Path) -> str | io.BytesIO:
+    """What plyfile reads: the path, or a copy in memory where comments are not ASCII, as other tools write them.
+
+    ValueError where the file is shorter than its header declares.
+    """
     header = []
     with path.open("rb") as file:
         while line := file.readline(16 << 20):
             header.append(line.decode(errors="replace"))
             if line.strip() == b"end_header":
-                return check_ply_counts(header, path.stat().st_size - file.tell())
+                check_ply_counts(header, path.stat().st_size - file.tell())
+                text = "".join(header)
+                if not text.isascii():  # escaped as in JSON, since names of objects may be in it
+                    text = re.sub("[^\\x00-\\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
+                    return io.BytesIO(text.encode() + file.read())
+                break
             if len(header) == 1 and line.strip() != b"ply":
                 break  # plyfile reports the error
+    return str(path)
 
 
 def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
@@ -82,8 +91,8 @@ def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
     n, quats = len(table), table[:, 7:11]
     sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major
     ids = np.asarray(raw["object_id"]) if "object_id" in stored else np.zeros(n)
-    if not ((ids >= 0) & (ids <= MAX_OBJECT_ID)).all():
-        raise ValueError(f"an object_id is not from 0 to {MAX_OBJECT_ID}")
+    if not ((ids >= 0) & (ids <= MAX_OBJECT_ID) & (ids == np.floor(ids))).all():
+        raise ValueError(f"an object_id is not a whole number from 0 to {MAX_OBJECT_ID}")
     ids = torch.from_numpy(ids.astype(np.int64))
     keep = (table.abs() <= LARGEST).all(1) & (table[:, 4:7] <= np.log(LARGEST)).all(1) & (quats.norm(dim=1) > 1e-12)
     if not keep.all():

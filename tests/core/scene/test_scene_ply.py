@@ -269,3 +269,34 @@ def test_more_gaussians_than_the_file_holds_are_refused_before_they_are_read(tmp
     monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("read"))
     with pytest.raises(InputError, match=r"s.ply: is not a readable PLY file .*declares \d+ bytes or more; it has"):
         read_scene(tmp_path / "s.ply")
+
+
+@pytest.mark.parametrize("order", ["<", ">", "text"])
+def test_comments_of_other_tools_need_not_be_ascii(tmp_path, two_balls, order):
+    write_scene(tmp_path / "s.ply", two_balls)
+    ply = PlyData.read(str(tmp_path / "s.ply"))
+    ply.text, ply.byte_order = (True, "=") if order == "text" else (False, order)
+    ply.write(str(tmp_path / "a.ply"))
+    data = (tmp_path / "a.ply").read_bytes()
+    data = data.replace(b"comment ngff:up", "comment José, 图, 😀\ncomment ".encode() + b"\xff\xfe\ncomment ngff:up", 1)
+    (tmp_path / "b.ply").write_bytes(data.replace(b"green ball", "grüner Ball 😀".encode()))
+    plain, found = read_scene(tmp_path / "a.ply"), read_scene(tmp_path / "b.ply")
+    assert [o.name for o in found.objects] == ["red ball", "grüner Ball 😀"]
+    for field in dataclasses.fields(plain.gaussians):
+        assert torch.equal(getattr(found.gaussians, field.name), getattr(plain.gaussians, field.name)), field.name
+    (tmp_path / "c.ply").write_bytes(data[:-500])
+    with pytest.raises(InputError, match="c.ply: is not a readable PLY file"):
+        read_scene(tmp_path / "c.ply")
+
+
+@pytest.mark.parametrize("id", [1.5, math.nan, -1.0, math.inf])
+def test_ids_of_objects_are_whole_numbers(tmp_path, two_balls, id):
+    write_scene(tmp_path / "a.ply", two_balls)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    rows = rows.astype([(name, "f4") for name in rows.dtype.names])
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "b.ply"))
+    assert read_scene(tmp_path / "b.ply").gaussians.object_id.unique().tolist() == [0, 1, 2]
+    rows["object_id"][-1] = id
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(InputError, match="an object_id is not a whole number from 0 to 65535"):
+        read_scene(tmp_path / "b.ply")

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -196,6 +197,9 @@ def _less_memory(what: str, command, remedies: list[str]) -> str:
 
 
 def fail(message: str, status: int) -> None:
-    """Exit with one line on stderr."""
-    print(f"ngff: {message}", file=sys.stderr)
+    """Exit with one line on stderr, below the progress bars that the error left open."""
+    if "tqdm" in sys.modules:
+        for bar in list(sys.modules["tqdm"].tqdm._instances):
+            bar.close()
+    print("ngff: " + re.sub(r"[\x00-\x1f\x7f]", "?", message), file=sys.stderr)  # what a user gave may have several
     sys.exit(status)

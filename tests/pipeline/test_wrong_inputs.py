@@ -1,15 +1,18 @@
 """Errors of the command line: one line on stderr, exit status 2, and no incomplete file."""
 
 import os
+import re
 import signal
+import sys
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
-from ngff_cli.options import run_command_line
+from ngff_cli.options import fail, run_command_line
 from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.scene_ply import write_scene
@@ -105,6 +108,15 @@ def fails_cleanly(words: str, command=call, expected=2) -> str:
 @pytest.mark.parametrize("line", WRONG)
 def test_wrong_input_gives_one_line_and_status_2(line):
     fails_cleanly(line)
+
+
+def test_an_error_is_one_line_below_the_progress_bar(capsys):
+    bar = iter(tqdm(range(3), file=sys.stderr))
+    next(bar)
+    with pytest.raises(SystemExit):
+        fail("--sync a\nb\x1b: choose", 2)
+    assert re.search(r"[^\n]\nngff: --sync a\?b\?: choose\n$", capsys.readouterr().err)
+    assert list(bar) == [1, 2]
 
 
 def work(*_, **__):

@@ -26,6 +26,20 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
+def find_link(file: h5py.File, name: str) -> h5py.HardLink | h5py.SoftLink | h5py.ExternalLink | None:
+    """The link of this name, or the first of its parents that is not a hard one; None where the file has none.
+
+    No link is followed, as h5py does in `name in file`: soft links may be cyclic, and external links may refer to any
+    file of the machine, or to a pipe, for which HDF5 waits.
+    """
+    parts = name.split("/")
+    for i in range(len(parts)):
+        link = file.get("/".join(parts[: i + 1]), getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            break
+    return link
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Expected shape, type and range of a dataset. A letter in the shape stands for the same length in all datasets."""
@@ -37,13 +51,11 @@ class Dataset:
 
     def open(self, file: h5py.File, name: str, lengths: dict[str, int]) -> h5py.Dataset:
         """The dataset, shape and type checked; adds new letters to `lengths`. Raises KeyError if absent, ValueError."""
-        parts = name.split("/")
-        for i in range(len(parts)):  # soft links may be cyclic, and external links may refer to any file of the machine
-            link = file.get("/".join(parts[: i + 1]), getlink=True)
-            if link is None:
-                raise KeyError(name)
-            if not isinstance(link, h5py.HardLink):
-                raise ValueError(f"{name} is a link")
+        link = find_link(file, name)
+        if link is None:
+            raise KeyError(name)
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{name} is a link")
         data = file[name]
         if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.shape is None:
             raise ValueError(f"{name} is not a dataset with values of its own")

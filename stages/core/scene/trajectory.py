@@ -21,7 +21,7 @@ from stages.core.scene.field_start import FieldStart, read_field_start, write_fi
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
-from stages.core.scene.h5_schema import Dataset, open_h5
+from stages.core.scene.h5_schema import Dataset, find_link, open_h5
 from stages.core.scene.prompt_rows import read_prompts
 from stages.core.scene.scene import Scene, read_metadata, read_objects
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
@@ -294,6 +294,9 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
         found = DATASETS[name].read(file, name, lengths)
         return found if isinstance(found, list) else torch.from_numpy(found)
 
+    def has(name: str) -> bool:
+        return find_link(file, name) is not None
+
     keypoints = Keypoints(values("keypoints/rest"), values("keypoints/object_id"))
     motion = (values("keypoints/positions"), values("objects/com"), values("objects/rotation"))
     gaussians = Gaussians(**{f.name: values(f"gaussians/{f.name}") for f in fields(Gaussians)})
@@ -303,7 +306,7 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
         raise ValueError(f"gaussians/sh has {lengths['k']} coefficients, not 1, 4, 9 or 16")
     _check_unit(gaussians.quats, "gaussians/quats")
     _check_unit(motion[2], "objects/rotation")
-    dense = "frames/means" in file
+    dense = has("frames/means")
     if dense:
         for name in ("means", "quats", "scales"):
             DATASETS[f"frames/{name}"].open(file, f"frames/{name}", lengths)
@@ -316,10 +319,10 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     if not (((binding.weight.sum(1) - 1).abs() < ROUNDING) | ~bound.any(1)).all():
         raise ValueError("binding/weight has a row that does not sum to 1")
     ids = values("objects/id").tolist()
-    materials = values("objects/material") if "objects/material" in file else [""] * len(ids)
+    materials = values("objects/material") if has("objects/material") else [""] * len(ids)
     objects = read_objects(zip(ids, values("objects/name"), materials, strict=True))
     cameras = None
-    if "cameras/viewmats" in file:
+    if has("cameras/viewmats"):
         *matrices, names = (values(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes", "names"))
         cameras = check_cameras(Cameras(*matrices, tuple(quote(name, 255) for name in names)))
     attributes = file.attrs
@@ -327,12 +330,12 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     made_by = parse_json(str(attributes.get("provenance", "{}")), finite=False)
     metadata = read_metadata(attributes.get("floor"), scale, made_by, attributes.get("background"))
     scene = Scene(gaussians, objects, cameras, **metadata)
-    texts = values("forces/json") if "forces/json" in file else []
+    texts = values("forces/json") if has("forces/json") else []
     forces = read_prompts(map(parse_json, texts), ids)
     dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
     info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
     measures = _read_plausibility(parse_json(str(attributes.get("plausibility", "{}"))))
-    confidence = values("objects/confidence") if "objects/confidence" in file else None
+    confidence = values("objects/confidence") if has("objects/confidence") else None
     return Trajectory(
         scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths), confidence, measures
     )

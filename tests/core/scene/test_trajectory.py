@@ -262,6 +262,21 @@ def test_times_between_frames_are_a_microsecond_to_hours(tmp_path, intact, dt, r
         assert read_trajectory(tmp_path / "t.h5").info.dt == dt
 
 
+@pytest.mark.parametrize("name", ["gaussians", "frames", "frames/means", "cameras", "forces", "objects/confidence"])
+def test_links_are_not_followed(tmp_path, intact, name):
+    """Not even to see whether something optional is there: HDF5 would wait for a pipe."""
+    path, dataset = tmp_path / "t.h5", {"cameras": "cameras/viewmats", "forces": "forces/json"}.get(name)
+    path.write_bytes(intact)
+    with h5py.File(tmp_path / "other.h5", "w"):
+        pass  # has nothing of it, so that a reader who follows the link takes it for absent
+    with h5py.File(path, "a") as file:
+        if name in file:
+            del file[name]
+        file[name] = h5py.ExternalLink("other.h5", "/")
+    with pytest.raises(InputError, match=f"{dataset or name}.* is a link"):
+        read_trajectory(path)
+
+
 def test_what_a_trajectory_may_lack(tmp_path, intact):
     for name in ("objects/material", "forces/json", "cameras/viewmats", "scale", "provenance", "floor"):
         change(tmp_path / "t.h5", intact, name, None)

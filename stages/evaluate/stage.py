@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stages.core.backends import load
 from stages.core.errors import InputError
-from stages.core.scene.files import check_output, must_exist, provenance, replacing
+from stages.core.scene.files import check_json_output, check_output, must_exist, provenance, replacing
 from stages.core.scene.formats import FORMATS
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result, format_table, to_json
@@ -52,11 +52,9 @@ def run(
     """
     predictions = [Path(p) for p in ([prediction] if isinstance(prediction, (str, Path)) else prediction)]
     out = Path(out or predictions[0].parent / "metrics.json")
-    if out.suffix.lower() != ".json" and not out.is_dir():
-        raise InputError(f"-o {out}: the results are a JSON file; use the suffix .json")
-    for path in (out, options.report):
-        if path is not None:
-            check_output(Path(path))
+    check_json_output(out)
+    if options.report is not None:
+        check_output(Path(options.report))
     if options.judge:
         result, inputs = _judge(predictions, truth, out, options)
     else:

@@ -32,8 +32,8 @@ PIPELINE = ("reconstruct", "segment", "refine", "simulate", "render", "evaluate"
 NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against", "as_json", "context"}
 
 
-def call(*args) -> tuple[int, str, str]:
-    """Exit status, stdout and stderr of `ngff ARGS`."""
+def call(*args, app=app) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of `ngff ARGS`, or of the command line `app`."""
     done = CliRunner().invoke(app, [str(a) for a in args])
     return done.exit_code, done.stdout, done.stderr
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from tqdm import tqdm
 
+from ngff_cli.lab import app as lab_app
 from ngff_cli.options import fail, run_command_line
 from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
@@ -150,6 +151,15 @@ def test_an_output_that_cannot_be_written_is_reported_before_the_work(stage, out
 def test_outputs_have_the_suffix_of_their_format_so_that_other_files_are_not_replaced(input_files, line):
     before = {name: (input_files / name).read_bytes() for name in ("good.ply", "good.h5")}
     assert "suffix" in fails_cleanly(line)
+    assert before == {name: (input_files / name).read_bytes() for name in before}
+
+
+@pytest.mark.parametrize("line", [
+    "fit good.ply good.h5 -o good.h5", "estimate-materials good.ply -o good.ply", "track good.ply empty -o good.ply",
+])  # fmt: skip
+def test_outputs_of_the_lab_have_the_suffix_of_their_format(input_files, line):
+    before = {name: (input_files / name).read_bytes() for name in ("good.ply", "good.h5")}
+    assert "suffix" in fails_cleanly(line, lambda *words: call(*words, app=lab_app))
     assert before == {name: (input_files / name).read_bytes() for name in before}
 
 

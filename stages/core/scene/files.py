@@ -42,6 +42,13 @@ def check_output(path: Path, *kinds: str) -> None:
         format_of(path, *kinds, writable=True)
 
 
+def check_json_output(path: Path) -> None:
+    """As `check_output`, for JSON: InputError for another suffix too, since it might be a file of another kind."""
+    check_output(path)
+    if path.suffix.lower() != ".json":
+        raise InputError(f"{path}: the file to write is JSON; use the suffix .json")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.models.chat_completions import ChatEndpoint, InvalidReply, image_part, json_object
-from stages.core.scene.files import provenance, replacing
+from stages.core.scene.files import check_json_output, provenance, replacing
 from stages.core.scene.images import sample_frames
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.schema import quote
@@ -44,6 +44,7 @@ def run(video: Path, out: Path, options: EstimateOptions) -> list[str]:
     Raises InputError for an unreadable video, an endpoint that fails, and replies that cannot be used.
     """
     video, out = Path(video), Path(out)
+    check_json_output(out)
     endpoint = ChatEndpoint.from_environment(options.model, options.timeout)
     names = object_names(options.objects)
     jpegs = sample_frames(video, options.frames, options.longest)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance, replacing
+from stages.core.scene.files import check_json_output, provenance, replacing
 from stages.core.scene.formats import format_of
 from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
@@ -62,6 +62,7 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
     `motion` is one trajectory, or films. Raises InputError for a motion that is not of the scene, and MissingPackage
     without the package cma.
     """
+    check_json_output(out)
     kinds = [format_of(path, "trajectory", "video").kind for path in motion]
     if kinds.count("trajectory") and len(kinds) > 1:
         raise InputError(f"{motion[kinds.index('trajectory')]}: a track is fitted alone; give it, or films")

@@ -15,7 +15,7 @@ from torch import Tensor
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
-from stages.core.scene.files import provenance
+from stages.core.scene.files import check_output, provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
@@ -33,6 +33,7 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
 
     Raises InputError for a scene without objects or films, films of other cameras, and label images of other films.
     """
+    check_output(Path(out), "trajectory")
     world, device = read_scene(scene), pick_device(options.device)
     if world.sequence is None or world.cameras is None:
         raise InputError(f"{scene}: does not say when its cameras filmed; make it with `ngff reconstruct --sequence`")

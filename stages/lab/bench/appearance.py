@@ -10,7 +10,6 @@ more from that run. Estimating it does not count as gsplat's time.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -27,7 +26,7 @@ from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import appearance_gsplat as peer
-from stages.lab.bench.common import machine, write_json
+from stages.lab.bench.common import earlier_results, machine, write_json
 from stages.lab.bench.reconstruct import photo_folder
 from stages.lab.bench.scene_options import AppearanceBenchOptions
 from stages.reconstruct import classic, sfm
@@ -70,7 +69,7 @@ def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterato
     if pick_device("auto") != "cuda":
         raise InputError("gsplat needs an NVIDIA GPU, and PyTorch finds none (see `ngff-lab doctor`)")
     folders = {folder: photo_folder(folder) for folder in map(Path, sets)}
-    rows = json.loads(out.read_text())["sets"] if out.exists() else {}
+    rows = earlier_results(out, "sets")
     yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo held out"
     head = f"{'held-out (exposed)':>23s} {'Gaussians':>9s} {'steps':>7s} {'time':>7s}"
     yield f"{'set':14s}   ours: {head}   gsplat: {head}"

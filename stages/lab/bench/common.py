@@ -14,8 +14,9 @@ from types import ModuleType
 import torch
 import warp as wp
 
-from stages.core.errors import MissingPackage
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import replacing
+from stages.core.scene.schema import reason
 
 
 def machine(device: str) -> str:
@@ -77,6 +78,20 @@ def float32_rate(device: str) -> float:
         return 2 * size**3 / median_seconds(lambda: a @ b, device)
     finally:
         torch.backends.cuda.matmul.allow_tf32 = allowed
+
+
+def earlier_results(out: Path, key: str) -> dict:
+    """The results by name that an earlier run stored in `out` under `key`; none where there is no such file.
+
+    Raises InputError where the file holds something else.
+    """
+    if not out.exists():
+        return {}
+    try:
+        found = json.loads(out.read_text())[key]
+        return dict(found.items())
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{out}: holds no results of this benchmark ({reason(error)}); name another file") from error
 
 
 def write_json(out: Path, facts: Mapping) -> None:

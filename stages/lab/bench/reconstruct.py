@@ -7,7 +7,6 @@ given there. Each set is reconstructed in a subprocess, so that its peak memory 
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import multiprocessing
@@ -29,7 +28,7 @@ from stages.core.geometry.rotations import rotation_angle
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.cameras import Cameras, read_cameras
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.bench.common import machine, write_json
+from stages.lab.bench.common import earlier_results, machine, write_json
 from stages.lab.bench.scene_options import ReconstructBenchOptions
 
 
@@ -51,7 +50,7 @@ def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterat
     if not sets:
         raise InputError("name one or more photo sets: a folder with images/ and, if there are any, cameras.json")
     photos = {folder: photo_folder(folder) for folder in map(Path, sets)}
-    rows = json.loads(out.read_text())["sets"] if out.exists() else {}
+    rows = earlier_results(out, "sets")
     yield f"{'set':14s} {'photos':7s} {'rotation':>9s} {'shift':>7s} {'held-out':>19s} {'wall':>6s} {'CPU':>8s}  memory"
     for folder, images in photos.items():
         try:

@@ -83,6 +83,15 @@ def test_photo_folder_is_found(tmp_path):
         list(bench.run([], tmp_path / "r.json", bench.ReconstructBenchOptions()))
 
 
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"sets": []}', "\xff", '{"rows": {}}'])
+def test_a_file_of_something_else_is_not_replaced(tmp_path, content):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "r.json").write_text(content, encoding="latin-1")
+    with pytest.raises(InputError, match="r.json: holds no results of this benchmark .*; name another file"):
+        list(bench.run([tmp_path], tmp_path / "r.json", bench.ReconstructBenchOptions()))
+    assert (tmp_path / "r.json").read_text(encoding="latin-1") == content
+
+
 def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch, device):
     report = dict(
         photos=5, placed=5, held_out={"photos": 1, "psnr": 20.0, "ssim": 0.7}, seconds={"model": 2.0}, memory=1.0,

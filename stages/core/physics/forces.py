@@ -116,7 +116,10 @@ def parse(
 
 def _force(text: str, objects: Sequence[SceneObject]) -> Force:
     where = f"--force {quote(repr(text))}"
-    words = dict(word.partition("=")[::2] for word in text.split())
+    pairs = [word.partition("=")[::2] for word in text.split()]
+    words = dict(pairs)
+    if len(words) < len(pairs):
+        raise InputError(f"{where}: gives a value twice; {FORCE_SYNTAX}")
     unknown = words.keys() - {"object", "force", "torque", "from", "to", "at"}
     if unknown:
         raise InputError(f"{where}: {quote(repr(sorted(unknown)[0]))} is not a known key; {FORCE_SYNTAX}")

@@ -165,6 +165,8 @@ def choose_materials(
     given: dict[int, MaterialChoice] = {}
     for key, value in (read_json_file(file, MATERIALS_FILE) if file else {}).items():
         o, where = find_object(key, objects, f"{file}"), f"{file}: {quote(key)}"
+        if o.id in given:
+            raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one material")
         several = isinstance(value, dict) and "parts" in value
         given[o.id] = _parts(value, where, Path(file).parent) if several else _material(value, where)
     for prompt in prompts:
@@ -230,9 +232,10 @@ def _material(value: object, where: str) -> MaterialChoice:
         raise InputError(f"{where}: the first of plastic must be positive for {material.model}; the "
                          f"parameters are: {MODELS[material.model].parameters}")  # fmt: skip
     if not (1e-3 <= material.E < 1e13 and 1e-3 <= material.density < 1e5 and -0.5 < material.nu < 0.49):
-        raise InputError(f"{where}: E and density must be positive and nu between -0.5 and 0.49")
+        raise InputError(f"{where}: E must be positive and below 1e13 Pa, density positive and below 1e5 kg/m^3, nu "
+                         "between -0.5 and 0.49")  # fmt: skip
     if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
-        raise InputError(f"{where}: friction must be 0 or more and loss between 0 and 2")
+        raise InputError(f"{where}: friction must be 0 or more and below 100, and loss between 0 and 2")
     return MaterialChoice("custom", material)
 
 

@@ -58,6 +58,7 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     ({"force": ["object=2 force=0,0"]}, "'0,0' is not three numbers"),
     ({"force": ["object=2 force=0,0,inf"]}, "is not three numbers"),
     ({"force": ["object=2 force=0,0,1 until=3"]}, "'until' is not a known key"),
+    ({"force": ["object=2 force=0,0,1 force=0,0,2"]}, "gives a value twice; write"),
     ({"force": ["object=2 force=0,0,1 from=x"]}, "'x' is not a number"),
     ({"force": ["object=2 force=0,0,1 from=0.3 to=0.1"]}, "the end must come after"),
     ({"force": ["object=2 force=0,0,1 from=-1 to=1"]}, "the simulation begins at 0 s"),

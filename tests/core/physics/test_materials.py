@@ -74,6 +74,8 @@ def test_invalid_prompts(prompt, message):
 @pytest.mark.parametrize("text, message", [
     ("{", "not JSON"), ("[]", "object name or id"), ('{"duck": 3}', "material's name"),
     ('{"duck": {"E": 1e5}}', "E, density"), ('{"duck": {"E": -1, "density": 1}}', "positive"),
+    ('{"duck": {"E": 1e5, "density": 1e6}}', "density positive and below 1e5"),
+    ('{"duck": "wood", "1": "steel"}', r"m.json: 1: object 1 \(.*duck.*\) is there twice; give it one material"),
     ('{"duck": {"E": 1e5, "density": 100, "nu": 0.5}}', "nu"), ('{"duck": {"E": "x", "density": 1}}', "numbers"),
     ('{"duck": {"E": 1e5, "density": 1, "colour": 1}}', "friction"),
     ('{"duck": {"E": 1e5, "density": 1, "friction": -1}}', "friction must be"),

@@ -22,6 +22,7 @@ URL = "https://api.openai.com/v1"
 ATTEMPTS, PAUSE = 3, 2.0  # on a busy or silent server; pause before the second attempt, then doubling [s]
 LONGEST_PAUSE = 60.0  # that a server may ask for with Retry-After [s]
 RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # HTTP statuses worth retrying
+MAX_TIMEOUT = 86_400  # [s]; sockets take no infinite one
 LARGEST_REPLY = 4 << 20  # usable replies have a few thousand characters [bytes]
 T = TypeVar("T")
 
@@ -65,8 +66,8 @@ class ChatEndpoint:
             raise InputError(f"{url} needs a key: set OPENAI_API_KEY, or OPENAI_BASE_URL for a server without keys")
         if not (key.isascii() and key.isprintable()):
             raise InputError("OPENAI_API_KEY: has characters that no key has, such as a line break; copy it again")
-        if not timeout > 0:
-            raise InputError(f"--timeout {timeout:g}: give seconds above 0")
+        if not 0 < timeout <= MAX_TIMEOUT:
+            raise InputError(f"--timeout {timeout:g}: give seconds above 0, at most {MAX_TIMEOUT}")
         return ChatEndpoint(url, model, key, timeout)
 
     def ask(self, messages: list[dict]) -> str:

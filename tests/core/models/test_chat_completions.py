@@ -86,7 +86,7 @@ def test_unusable_settings_are_reported_before_anything_is_sent(chat_server, mon
             ask(url=url)
     with pytest.raises(InputError, match="no connection"):
         ask(url="http://127.0.0.1:9/v1")  # nobody listens there
-    for timeout in (0.0, -1.0, float("nan")):
+    for timeout in (0.0, -1.0, float("nan"), float("inf"), 1e30):
         with pytest.raises(InputError, match="--timeout"):
             ask(timeout=timeout)
     monkeypatch.setenv("OPENAI_API_KEY", "two\nlines")

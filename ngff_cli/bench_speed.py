@@ -82,7 +82,8 @@ def bench_rollout(
     weights: Annotated[
         Path | None, Option(help="weights of the force field (.safetensors); default: those in the package")
     ] = RolloutBenchOptions.weights,
-    keypoints: Annotated[int, Option(help="keypoints of each of the three objects")] = RolloutBenchOptions.keypoints,
+    objects: Annotated[int, Option(help="objects of a scene, in piles of three")] = RolloutBenchOptions.objects,
+    keypoints: Annotated[int, Option(help="keypoints of each object")] = RolloutBenchOptions.keypoints,
     steps: Annotated[int, Option(help="number of 0.02 s steps")] = RolloutBenchOptions.steps,
     scenes: Annotated[
         list[int], Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")
@@ -94,9 +95,7 @@ def bench_rollout(
     """Learned force field: time of a rollout, compared with the published model and MPM."""
     from stages.lab.bench.rollout import run
 
-    options = RolloutBenchOptions(
-        weights=weights, keypoints=keypoints, steps=steps, scenes=tuple(scenes), repeat=repeat, device=device
-    )
+    options = RolloutBenchOptions(weights, objects, keypoints, steps, tuple(scenes), repeat, device)
     print_results(lambda path: run(path, options), out, as_json)
 
 

@@ -1,9 +1,9 @@
 """Benchmark of rollout time: our force field, compared with the published model and MPM in the same run.
 
-Three ellipsoids fall onto each other and onto the floor, 100 steps of 0.02 s. The time covers everything from the
-keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks, integration;
-Gaussians are not moved. The operations of the networks are given as a share of the rate of a float32 matrix product.
-Recording a CUDA graph, once for a model and a problem size, is reported separately.
+Ellipsoids in piles of three fall onto each other and onto the floor, 100 steps of 0.02 s. The time covers everything
+from the keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks,
+integration; Gaussians are not moved. The operations of the networks are given as a share of the rate of a float32
+matrix product. Recording a CUDA graph, once for a model and a problem size, is reported separately.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
 from stages.lab.bench.speed_options import RolloutBenchOptions
 
-SCENE_OBJECTS = 3
+PILE, PILE_WIDTH = 3, 0.7  # objects above each other, and from one pile to the next [m]
 PEER = "ngff-paper, step by step"  # the baseline, as published
 
 
-def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
-    """Copies of one scene of three ellipsoidal shells above each other and above the floor."""
+def ellipsoids(scenes: int, keypoints: int, objects: int = PILE) -> InitialConditions:
+    """Copies of one scene of ellipsoidal shells above each other and above the floor, in a row of piles of three."""
     rng = torch.Generator().manual_seed(0)
-    ball = torch.nn.functional.normalize(torch.randn(SCENE_OBJECTS, keypoints, 3, generator=rng), dim=-1)
+    ball = torch.nn.functional.normalize(torch.randn(objects, keypoints, 3, generator=rng), dim=-1)
     offsets = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
-    points = ball * torch.tensor([0.25, 0.2, 0.15]) + offsets[:, None]
     mass, E = torch.tensor([0.5, 2.0, 1.0]), torch.tensor([1e5, 1e4, 8e5])
+    number = torch.arange(objects)
+    pile, place = number // PILE, number % PILE
+    at = offsets[place] + PILE_WIDTH * pile[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    points, mass, E = ball * torch.tensor([0.25, 0.2, 0.15]) + at[:, None], mass[place], E[place]
     return InitialConditions.of(points.repeat(scenes, 1, 1, 1), mass=mass, E=E)
 
 
@@ -52,7 +55,7 @@ def run(out: Path, options: RolloutBenchOptions) -> Iterator[str]:
     yield bench.machine(device)
     facts = {
         "machine": bench.machine(device), "threads": torch.get_num_threads(),
-        "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": SCENE_OBJECTS,
+        "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": options.objects,
         "keypoints": options.keypoints, "steps": options.steps, "rows": [],
     }  # fmt: skip
     rate, out = bench.float32_rate(device), Path(out)
@@ -72,7 +75,7 @@ def _measured(
     model: Dynamics, paper: Dynamics, scenes: int, device: str, options: RolloutBenchOptions
 ) -> Iterator[dict]:
     """A row for each model and way of rolling out a batch of scenes."""
-    start, count = ellipsoids(scenes, options.keypoints).to(device), options.steps + 1
+    start, count = ellipsoids(scenes, options.keypoints, options.objects).to(device), options.steps + 1
     plain = rollout_stepwise(model, start, count)
     yield _row("ngff, step by step", scenes, lambda: rollout_stepwise(model, start, count), device, options.repeat)
     for precision in ("highest", "high") if device != "cpu" else ():  # FP32 or TF32 matrix products
@@ -94,7 +97,7 @@ def _measured(
     if device != "cpu":
         stepper = TimeStepper(paper, start)
         yield _row("ngff-paper, replayed", scenes, lambda: _again(stepper, start, count), device, options.repeat)
-    particles = SCENE_OBJECTS * options.keypoints
+    particles = options.objects * options.keypoints
     mpm = bench_mpm.measure(particles, scenes, device, 2)
     seconds = 1e-6 * mpm["substep_us"] * bench_mpm.SUBSTEPS * options.steps
     yield {"what": f"MPM, {mpm['particles']:,} particles", "scenes": scenes, "seconds": _rounded(seconds)}
@@ -105,7 +108,10 @@ def _operations(model: Dynamics, options: RolloutBenchOptions, device: str) -> i
 
     With autograd on there are no fused kernels, whose operations PyTorch does not count; no graph is kept.
     """
-    model, start = copy.deepcopy(model).requires_grad_(False), ellipsoids(1, options.keypoints).to(device)
+    model, start = (
+        copy.deepcopy(model).requires_grad_(False),
+        ellipsoids(1, options.keypoints, options.objects).to(device),
+    )
     with FlopCounterMode(display=False) as counter, torch.enable_grad():
         model.rollout(start, options.steps + 1, FRAME)
     return counter.get_total_flops()

@@ -54,6 +54,7 @@ class RolloutBenchOptions:
     """Model and size of the rollouts."""
 
     weights: Path | None = None  # of our force field; None: the shipped ones
+    objects: int = 3  # of a scene
     keypoints: int = 2048  # of an object
     steps: int = 100
     scenes: tuple[int, ...] = ()  # batch sizes; empty: 1 and, on a GPU, 64
@@ -61,8 +62,8 @@ class RolloutBenchOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        if min((self.keypoints, self.steps, self.repeat, *self.scenes)) < 1:
-            raise InputError("--keypoints, --steps, --scenes and --repeat must be at least 1")
+        if min((self.objects, self.keypoints, self.steps, self.repeat, *self.scenes)) < 1:
+            raise InputError("--objects, --keypoints, --steps, --scenes and --repeat must be at least 1")
 
 
 @dataclass(frozen=True)

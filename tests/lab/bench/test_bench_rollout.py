@@ -24,6 +24,13 @@ def test_scene_has_contacts():
     assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
+def test_more_objects_stand_in_piles_beside_each_other():
+    three, seven = ellipsoids(1, 20), ellipsoids(1, 20, 7)
+    assert torch.equal(three.mass[0], seven.mass[0, :3]) and torch.equal(seven.E[0, 3:6], three.E[0])
+    middle = seven.points[0].mean(1)
+    assert ((middle[3:6, 0] - middle[:3, 0] - 0.7).abs() < 0.1).all() and seven.points.shape[1] == 7
+
+
 def test_run_has_all_rows_and_keeps_those_of_another_device(tmp_path, monkeypatch, device):
     torch.manual_seed(0)
     save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))

@@ -126,7 +126,7 @@ def work(*_, **__):
 
 WORK = {  # of each stage: function that is called after the output is checked, and what it is replaced by
     "reconstruct": ("read_photos", work), "segment": ("choose", lambda *_: work), "refine": ("refine", work),
-    "simulate": ("with_objects", work), "render": ("load", lambda *_: work), "evaluate": ("choose", lambda *_: work),
+    "simulate": ("with_objects", work), "render": ("load", lambda *_: work), "evaluate": ("load", lambda *_: work),
 }  # fmt: skip
 SOURCES = {"evaluate": "good.h5 --against good.h5"}  # of the other stages good.ply
 

@@ -20,6 +20,7 @@ from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
+FOCAL_STARTS = 1.2, 0.8  # of photos without EXIF [longer sides]: COLMAP's, and the main cameras of phones
 MAX_EPIPOLAR_ERROR = 0.006  # for given cameras [photo sizes]: 4 px of 640
 MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # indices of two photos, and matching pixels (k, 2) in each
 
@@ -54,8 +55,8 @@ def build_database(
 def initial_cameras(photos: Photos) -> list:
     """Initial pycolmap camera of each photo, shared by photos of the same size and EXIF focal length.
 
-    Without EXIF the focal length is 1.2 times the longer side. The model is SIMPLE_RADIAL, which is enough for phones
-    and most lenses; sharing stabilises weak geometry.
+    Without EXIF the focal length is FOCAL_STARTS[0] times the longer side. The model is SIMPLE_RADIAL, which is enough
+    for phones and most lenses; sharing stabilises weak geometry.
     """
     import pycolmap
 
@@ -64,11 +65,23 @@ def initial_cameras(photos: Photos) -> list:
     for k, (size, focal) in enumerate(dict.fromkeys(kinds)):
         camera = pycolmap.Camera(
             model="SIMPLE_RADIAL", width=size[0], height=size[1],
-            params=[focal or 1.2 * max(size), size[0] / 2, size[1] / 2, 0.0], camera_id=k + 1,
+            params=[focal or FOCAL_STARTS[0] * max(size), size[0] / 2, size[1] / 2, 0.0], camera_id=k + 1,
         )  # fmt: skip
         camera.has_prior_focal_length = focal > 0
         cameras[size, focal] = camera
     return [cameras[kind] for kind in kinds]
+
+
+def set_unknown_focals(database: Path, factor: float) -> None:
+    """Set the focal lengths that no EXIF tells to `factor` times the longer side."""
+    import pycolmap
+
+    file = pycolmap.Database.open(database)
+    for camera in file.read_all_cameras():
+        if not camera.has_prior_focal_length:
+            camera.params = [factor * max(camera.width, camera.height), *camera.params[1:]]
+            file.update_camera(camera)
+    file.close()
 
 
 def verified_pairs(database: Path) -> list[MatchedPair]:

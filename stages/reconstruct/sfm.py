@@ -2,6 +2,8 @@
 
 Results are reproducible for a seed on the same machine: feature extraction and matching are deterministic, RANSAC is
 seeded, and verification and mapping run on one thread, since the order of floating-point sums depends on scheduling.
+A self-calibration may end in a wrong focal length, so that photos of which none is known are mapped from two starts, of
+which the better one counts.
 Source: Schönberger and Frahm 2016, "Structure-from-motion revisited".
 """
 
@@ -24,7 +26,7 @@ from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import features, matching
 from stages.reconstruct.colmap import colmap_process, import_pycolmap, run_colmap
 from stages.reconstruct.epipolar import EpipolarLines
-from stages.reconstruct.matching import MatchedPair, MatchingOptions
+from stages.reconstruct.matching import FOCAL_STARTS, MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
@@ -64,9 +66,7 @@ def estimate_cameras(
 
 
 def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
-    """The largest model that COLMAP maps from the database."""
-    import pycolmap
-
+    """The best model that COLMAP maps from the database."""
     pairs = matching.verified_pairs(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
@@ -75,22 +75,42 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
             f"{photos.source}: the camera hardly moved between the photos; walk around the objects, or, if they are "
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        tqdm(total=len(photos), desc="placing photos", unit="photo", leave=False) as bar,
-    ):
-        with features.writing_database(Path(folder)):
-            run_colmap("map", folder, bar.update, database=str(database), photos=len(photos), seed=seed)
-        models = {int(path.name): pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())}
-    best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
-    if best is None or best.num_reg_images() < 2 or best.num_points3D() < 50:
+    found = []
+    for factor in FOCAL_STARTS[: 1 if all(photos.focals) else None]:
+        matching.set_unknown_focals(database, factor)
+        models = _mapped(photos, database, seed)
+        best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+        if best is not None and best.num_reg_images() >= 2 and best.num_points3D() >= 50:
+            found.append((best, models))
+    if not found:
         raise InputError(f"{photos.source}: {_failure_reason(len(photos), len(pairs))}")
+    best, models = max(found, key=lambda one: _quality(one[0]))
     model = _from_colmap(best, _drop_reasons(photos, pairs, best, models))
     log.info(
         "placed %d of %d photos, %d points, mean reprojection error %.2f px",
         len(model.cameras), len(photos), len(model.points), best.compute_mean_reprojection_error(),
     )  # fmt: skip
     return model
+
+
+def _quality(model) -> tuple[int, float]:
+    """By which models from several starts are compared: photos, then the mean reprojection error (wrong focal lengths
+    give more points, as tracks break).
+    """
+    return model.num_reg_images(), -model.compute_mean_reprojection_error()
+
+
+def _mapped(photos: Photos, database: Path, seed: int) -> list:
+    """The pycolmap models of photos that COLMAP's incremental mapper can join."""
+    import pycolmap
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tqdm(total=len(photos), desc="placing photos", unit="photo", leave=False) as bar,
+    ):
+        with features.writing_database(Path(folder)):
+            run_colmap("map", folder, bar.update, database=str(database), photos=len(photos), seed=seed)
+        return [pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())]
 
 
 def _failure_reason(photos: int, pairs: int) -> str:
@@ -111,10 +131,10 @@ def _is_stationary(pairs: list[MatchedPair], photos: Photos) -> bool:
     return float(np.median(moved)) < MIN_IMAGE_MOTION
 
 
-def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) -> dict[str, str]:
+def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: list) -> dict[str, str]:
     """The likely reason for each photo that is not in the best model."""
     placed = {best.images[i].name for i in best.reg_image_ids()}
-    others = [{m.images[i].name for i in m.reg_image_ids()} for m in models.values() if m is not best]
+    others = [{m.images[i].name for i in m.reg_image_ids()} for m in models if m is not best]
     common = np.zeros((len(photos), len(photos)), int)
     for i, j, a, _ in pairs:
         common[i, j] = common[j, i] = len(a)

@@ -1,6 +1,8 @@
 """Realistic photo sets: cameras are found, or the error says what to change."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -54,6 +56,35 @@ def test_two_photos_are_enough_for_cameras(tmp_path):
     true = arc(2, (320, 240), sweep=30.0)
     model = sfm.estimate_cameras(as_photos([photograph(true, i)[0] for i in range(2)], true.names, tmp_path))
     assert len(model.cameras) == 2 and len(model.points) >= 50
+
+
+def test_a_focal_length_that_starts_far_off_is_found_from_another_start(tmp_path, monkeypatch):
+    true = arc(6, (320, 240))
+    photos = as_photos([photograph(true, i)[0] for i in range(6)], true.names, tmp_path)
+
+    def focal_error(*starts: float) -> float:
+        monkeypatch.setattr(sfm, "FOCAL_STARTS", starts)
+        Ks = sfm.estimate_cameras(photos).cameras.Ks
+        return float((Ks[:, 0, 0] / true.Ks[: len(Ks), 0, 0] - 1).abs().max())
+
+    assert focal_error(10.0) > 1
+    assert focal_error(10.0, 1.2) < 0.03 and focal_error(1.2, 10.0) < 0.03
+
+
+def test_photos_with_a_known_focal_length_are_mapped_once(tmp_path, monkeypatch):
+    true, runs, mapped = arc(4, (320, 240), sweep=40.0), [], sfm._mapped
+    monkeypatch.setattr(sfm, "_mapped", lambda *given: runs.append(0) or mapped(*given))
+    photos = as_photos([photograph(true, i)[0] for i in range(4)], true.names, tmp_path)
+    sfm.estimate_cameras(photos)
+    sfm.estimate_cameras(replace(photos, focals=(float(true.Ks[0, 0, 0]),) * 4))
+    assert len(runs) == 2 + 1
+
+
+def test_of_models_with_as_many_photos_that_of_the_smaller_error_is_better():
+    def model(photos: int, error: float) -> SimpleNamespace:
+        return SimpleNamespace(num_reg_images=lambda: photos, compute_mean_reprojection_error=lambda: error)
+
+    assert sfm._quality(model(20, 0.8)) > sfm._quality(model(20, 1.27)) > sfm._quality(model(12, 0.5))
 
 
 def test_people_walking_through(tmp_path):

@@ -2,8 +2,8 @@
 
 Results are reproducible for a seed on the same machine: feature extraction and matching are deterministic, RANSAC is
 seeded, and verification and mapping run on one thread, since the order of floating-point sums depends on scheduling.
-A self-calibration may end in a wrong focal length, so that photos of which none is known are mapped from two starts, of
-which the better one counts.
+Self-calibration of few photos may end in a wrong focal length; where it is not known, they are mapped from two starts,
+of which the better one counts.
 Source: Schönberger and Frahm 2016, "Structure-from-motion revisited".
 """
 
@@ -33,6 +33,7 @@ from stages.reconstruct.step_cache import StepCache
 log = logging.getLogger(__name__)
 MIN_FITTING = 0.2  # smallest share of the matches that given cameras must explain
 MIN_IMAGE_MOTION = 0.005  # median displacement of matches of a camera that moves [photo sizes]
+MAX_MAPPED_TWICE = 40  # photos; more constrain the focal length better, and another mapping would take minutes
 CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
 
@@ -76,7 +77,8 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
     found = []
-    for factor in FOCAL_STARTS[: 1 if all(photos.focals) else None]:
+    once = all(photos.focals) or len(photos) > MAX_MAPPED_TWICE
+    for factor in FOCAL_STARTS[: 1 if once else None]:
         matching.set_unknown_focals(database, factor)
         models = _mapped(photos, database, seed)
         best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)

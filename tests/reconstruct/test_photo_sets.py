@@ -71,13 +71,16 @@ def test_a_focal_length_that_starts_far_off_is_found_from_another_start(tmp_path
     assert focal_error(10.0, 1.2) < 0.03 and focal_error(1.2, 10.0) < 0.03
 
 
-def test_photos_with_a_known_focal_length_are_mapped_once(tmp_path, monkeypatch):
+def test_many_photos_and_those_with_a_known_focal_length_are_mapped_once(tmp_path, monkeypatch):
     true, runs, mapped = arc(4, (320, 240), sweep=40.0), [], sfm._mapped
     monkeypatch.setattr(sfm, "_mapped", lambda *given: runs.append(0) or mapped(*given))
     photos = as_photos([photograph(true, i)[0] for i in range(4)], true.names, tmp_path)
     sfm.estimate_cameras(photos)
     sfm.estimate_cameras(replace(photos, focals=(float(true.Ks[0, 0, 0]),) * 4))
     assert len(runs) == 2 + 1
+    monkeypatch.setattr(sfm, "MAX_MAPPED_TWICE", 3)
+    sfm.estimate_cameras(photos)
+    assert len(runs) == 2 + 1 + 1
 
 
 def test_of_models_with_as_many_photos_that_of_the_smaller_error_is_better():

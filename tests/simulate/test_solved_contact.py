@@ -59,11 +59,11 @@ def test_is_the_default_for_stiff_bodies():
     assert with_engine(options, scene, choose_keypoints(scene, 32), thrown).contact == "solved"
 
 
-def test_balls_that_overlap_at_the_start_are_not_pushed_apart():
+def test_balls_that_overlap_at_the_start_are_not_pushed_apart(device):
     """Side by side on the floor, by a twentieth of their radius."""
     surfaces = [ellipsoid((0.1,) * 3, 2000).moved((x, 0.0, 0.1)) for x in (0.0, 0.195)]
     grey = torch.full((2000, 3), 0.5)
     parts = [to_gaussians(s, grey[: len(s.points)], i + 1, widest=math.inf) for i, s in enumerate(surfaces)]
     scene = Scene(concatenate(parts), (SceneObject(1, "left"), SceneObject(2, "right")), None, 0.0)
-    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=16, keypoints=64, device="cpu"))
+    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=16, keypoints=64, device=device))
     assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3

@@ -15,8 +15,8 @@ KEY = "not-a-real-key"
 class Server(ThreadingHTTPServer):
     """Replies with the entries of `script`, one per request.
 
-    An entry is the text of a reply; a status, or (status, headers); bytes as the body; seconds of silence; a function
-    that gets the handler and writes what it likes; or "close", which ends the connection without a word.
+    An entry is the text of a reply; a status, or (status, headers); bytes as the body; a function that gets the
+    handler and writes what it likes; or "close", which ends the connection without a word.
     """
 
     daemon_threads = True
@@ -25,6 +25,13 @@ class Server(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.script, self.asked, self.keys = [], [], []
         self.url = f"http://127.0.0.1:{self.server_address[1]}/v1"
+
+    def wait_for(self, requests: int) -> None:
+        """Until so many have been read, at most 10 s: a client may give up before a busy machine reads its request."""
+        for _ in range(1000):
+            if len(self.asked) >= requests:
+                break
+            time.sleep(0.01)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -36,8 +43,6 @@ class Handler(BaseHTTPRequestHandler):
         reply = script(body) if callable(script) else script.pop(0)
         if callable(reply):
             reply(self)
-        elif isinstance(reply, float):
-            time.sleep(reply)
         elif reply != "close":
             self.answer(reply)
 

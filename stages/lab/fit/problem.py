@@ -201,11 +201,12 @@ def pose_problem(
         simulate = replace(simulate, contact="learned")
     choices = choose_materials(scene.objects, options.material)
     materials = {i: choice.material for i, choice in choices.items()}
-    parameters = _parameters(scene, keypoints, frames, prompts, simulate, materials)
+    noise = options.noise or estimate_noise(frames)
+    posed = Problem(scene, keypoints, frames, prompts, simulate, materials, (), noise)
+    parameters = _parameters(posed)
     if not parameters:
         raise InputError(f"{where}: nothing moves in it")
-    noise = options.noise or estimate_noise(frames)
-    return Problem(scene, keypoints, frames, prompts, simulate, materials, tuple(parameters), noise)
+    return replace(posed, parameters=tuple(parameters))
 
 
 def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
@@ -249,47 +250,48 @@ def _lifts(
     return lifts
 
 
-def _parameters(
-    scene: Scene, keypoints: Keypoints, frames: Float[Tensor, "t k 3"], prompts: ForcePrompts,
-    options: SimulateOptions, materials: dict[int, Material],
-) -> list[Parameter]:  # fmt: skip
+def _parameters(problem: Problem) -> list[Parameter]:
     """Quantities of the objects that move, and velocities of those that do so from the start.
 
     Without forces a common factor of all densities changes nothing: the first object's stays.
     """
     parameters: list[Parameter] = []
-    names = RIGID if options.engine == "rigid" else tuple(QUANTITIES)
-    weighed = bool(prompts.forces)
-    for o in scene.objects:
-        mine = keypoints.object_id == o.id
-        size = float(_size(keypoints, o.id))
-        centre = frames[:, mine].mean(1)
-        if float((centre - centre[0]).norm(dim=1).max()) < STILL * size or o.id in prompts.pinned:
+    names = RIGID if problem.options.engine == "rigid" else tuple(QUANTITIES)
+    weighed = bool(problem.prompts.forces)
+    released = problem.first_frames(FIRST_FRAMES + 1).motion(())
+    for o in problem.scene.objects:
+        mine = problem.keypoints.object_id == o.id
+        size = float(_size(problem.keypoints, o.id))
+        centre, still = problem.track[:, mine].mean(1), STILL * size
+        if float((centre - centre[0]).norm(dim=1).max()) < still or o.id in problem.prompts.pinned:
             log.info("object %d (%s) does not move; its material stays", o.id, o.name)
             continue
         chosen = [name for name in names if name != "density" or weighed]
         weighed = True
-        parameters += material_parameters(o.id, materials[o.id], chosen)
-        parameters += velocity_parameters(o.id, _first_velocity(centre, STILL * size, scene, options))
+        parameters += material_parameters(o.id, problem.materials[o.id], chosen)
+        fall = released[:, mine].mean(1)
+        stands = bool((fall - fall[0])[:, 2].abs().max() < still)
+        parameters += velocity_parameters(o.id, _first_velocity(problem, centre, still, stands))
     return parameters
 
 
-def _first_velocity(
-    centre: Float[Tensor, "t 3"], still: float, scene: Scene, options: SimulateOptions
-) -> dict[str, float]:
+def _first_velocity(problem: Problem, centre: Float[Tensor, "t 3"], still: float, stands: bool) -> dict[str, float]:
     """A guess of the start velocity of an object by axis [scene units/s], from the first frames of its middle.
 
     Nothing for one that is released from rest, and no vertical velocity of one that is supported: whose height is
-    constant, or is nearer to that than to free flight, as of one that settles.
+    constant, or is nearer to that than to free flight, as of one that settles; or which `stands` where it is released
+    from rest and does not hop higher than `still`, since tracks from one camera rise and fall by errors of its depth.
     """
+    unit = problem.scene.metres_per_unit
     first = centre[: FIRST_FRAMES + 1]
-    t = options.dt * torch.arange(len(first))
-    fall = options.gravity / scene.metres_per_unit * t**2 / 2  # of an unsupported object
+    t = problem.options.dt * torch.arange(len(first))
+    gravity = problem.options.gravity / unit
     path = first - first[0]
-    flight = path + fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    flight = path + gravity * (t**2 / 2)[:, None] * torch.tensor([0.0, 0.0, 1.0])  # less the fall of a free object
     velocity = (t[:, None] * flight).sum(0) / t.square().sum()
     off = (flight[:, 2] - velocity[2] * t).norm()
     supported = bool((path[:, 2].abs() < still).all() or path[:, 2].norm() < off)
+    supported |= stands and bool(velocity[2] < (2 * gravity * still) ** 0.5)
     if float((path[:, :2] if supported else flight).norm(dim=1).max()) < still:
         return {}
     return dict(zip(AXES[: 2 if supported else 3], velocity.tolist(), strict=False))

@@ -1,6 +1,7 @@
 """Shared by both command lines: option types, --json, logging and error reports."""
 
 import errno
+import gc
 import logging
 import os
 import re
@@ -42,6 +43,7 @@ INTERRUPTED = "interrupted; no incomplete file is left"
 OUT_OF_MEMORY = "{} is out of memory: close other programs that use it"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
+NEW_OBJECTS = 20_000  # of Python, at which it looks for garbage; its own 700 take 2 to 5 % of a command
 
 
 class StderrHandler(logging.Handler):
@@ -60,6 +62,7 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, interrupt)
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may have it ignored
         signal.signal(signal.SIGINT, interrupt)
+    gc.set_threshold(NEW_OBJECTS)
     try:
         app(words)
     except KeyboardInterrupt:  # before the command has begun
@@ -68,6 +71,8 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
         if _is_out_of_memory(error):
             fail(OUT_OF_MEMORY.format("the machine"), 1)
         raise
+    finally:
+        gc.freeze()  # else Python searches the objects of all modules for garbage as it ends, for most of a second
 
 
 def interrupt(number: int, frame) -> None:

@@ -7,20 +7,14 @@ import typer
 from typer import Argument, Option
 from typer.models import OptionInfo
 
-from ngff_cli.options import AsJson, Device, Keypoints, Out, SceneCount, Seed, print_results
+from ngff_cli.options import AsJson, Device, Out, print_results, with_options
 from stages.lab.assets.objects import ObjectsOptions
 from stages.lab.clutter.options import ClutterOptions
 from stages.lab.dataset.options import DatasetOptions, HeldoutOptions
 
 app = typer.Typer()
 
-Groups = Annotated[str, Option(help="groups of scenes, such as 3_0..3_9,4")]
 Sheet = Annotated[Path | None, Option(help="contact sheet to write (.jpg)")]
-Dx = Annotated[float, Option(help="grid spacing [m]; published: 0.02")]
-ParticleSpacing = Annotated[float, Option(help="spacing of particles on a surface [m]")]
-Substep = Annotated[
-    float, Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
-]
 
 
 def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
@@ -41,40 +35,11 @@ def example(
 
 
 @app.command()
+@with_options
 def dataset(
+    *,
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
-    groups: Annotated[
-        str, Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
-    ] = DatasetOptions.groups,
-    parts: Annotated[
-        str,
-        Option(
-            help="what to generate, separated by commas: motions, scenes, mpm, initial, dynamic, "
-            "objects, backgrounds, scene_configs"
-        ),
-    ] = DatasetOptions.parts,
-    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = DatasetOptions.frames,
-    keypoints: Annotated[int, Option(help="keypoints per object in motions")] = DatasetOptions.keypoints,
-    dx: Dx = DatasetOptions.dx,
-    spacing: ParticleSpacing = DatasetOptions.spacing,
-    substep: Substep = DatasetOptions.substep,
-    nudge: Annotated[
-        float, Option(help="shift of each object's initial position [m]; see `statistics --against`")
-    ] = DatasetOptions.nudge,
-    exact: Annotated[
-        bool,
-        Option(
-            "--exact",
-            help="bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic",
-        ),
-    ] = DatasetOptions.exact,
-    views: Annotated[str, Option(help="views of the videos: some of 0,4,...,96, or all")] = DatasetOptions.views,
-    backgrounds: Annotated[
-        str, Option(help="backgrounds of the videos: some of table0,...,table7, or all")
-    ] = DatasetOptions.backgrounds,
-    resolution: Annotated[int, Option(help="side of the videos [px]")] = DatasetOptions.resolution,
-    shard: Annotated[str, Option(help="i/n: the i-th of n equal parts of the groups")] = DatasetOptions.shard,
-    limit: Annotated[int, Option(help="scenes of each group; 0: all")] = DatasetOptions.limit,
+    options: DatasetOptions,
     check: Annotated[bool, Option("--check", help="only compare all files with their checksums")] = False,
     ray: Annotated[
         str,
@@ -83,16 +48,10 @@ def dataset(
             "FOLDER at the same path; each makes one group at a time"
         ),
     ] = "",
-    device: Device = DatasetOptions.device,
 ) -> None:
     """Generate GSCollision: scenes, their motion, and videos, in the published layout."""
     from stages.lab.dataset import generate, ray_cluster
 
-    options = DatasetOptions(
-        groups=groups, parts=parts, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        nudge=nudge, exact=exact, views=views, backgrounds=backgrounds, resolution=resolution, shard=shard,
-        limit=limit, device=device,
-    )  # fmt: skip
     if check:
         generate.check(out)
     elif ray:
@@ -120,7 +79,7 @@ def import_(
 def statistics(
     data: Annotated[Path, Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
     out: Out = None,
-    groups: Groups = DatasetOptions.groups,
+    groups: Annotated[str, Option(help="groups of scenes, such as 3_0..3_9,4")] = DatasetOptions.groups,
     keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 512,
     against: Annotated[
         Path | None, Option(help="the same scenes made with --nudge: report the predictability instead")
@@ -149,7 +108,7 @@ def statistics(
 @app.command()
 def study(
     out: Out = None,
-    scenes: SceneCount = 24,
+    scenes: Annotated[int, Option(help="number of scenes")] = 24,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -160,21 +119,18 @@ def study(
 
 
 @app.command()
+@with_options
 def objects(
+    *,
     out: Annotated[Path, Argument(metavar="FOLDER", help="output folder, with one folder per object")],
-    only: Annotated[
-        str, Option(help="names of the objects, such as ball,duck; default: all ten")
-    ] = ObjectsOptions.only,
+    options: ObjectsOptions,
     meshes: Annotated[list[Path], meshes_option("to convert instead", "textured mesh")] = [],  # noqa: B006
-    count: Annotated[int, Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
-    up: Annotated[str, Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
-    light: Annotated[bool, Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
     sheet: Sheet = None,
 ) -> None:
     """Generate the ten objects of the data set as Gaussians, or convert meshes to such objects."""
     from stages.lab.assets.objects import run
 
-    for line in run(out, ObjectsOptions(only=only, count=count, up=up, light=light), meshes, sheet):
+    for line in run(out, options, meshes, sheet):
         print(line, flush=True)
 
 
@@ -192,69 +148,26 @@ def backgrounds(
 
 
 @app.command()
+@with_options
 def heldout(
+    *,
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
     meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
-    scenes: SceneCount = HeldoutOptions.scenes,
-    objects: Annotated[int, Option(help="objects per scene")] = HeldoutOptions.objects,
-    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = HeldoutOptions.frames,
-    keypoints: Keypoints = HeldoutOptions.keypoints,
-    dx: Dx = HeldoutOptions.dx,
-    spacing: ParticleSpacing = HeldoutOptions.spacing,
-    substep: Substep = HeldoutOptions.substep,
-    size: Annotated[float, Option(help="longest side of a mesh [m]")] = HeldoutOptions.size,
-    shapes: Annotated[
-        int,
-        Option(
-            help="number of random objects for training, written as the group varied (with --from made of its meshes: "
-            "the group meshes); 0: none"
-        ),
-    ] = HeldoutOptions.shapes,
-    solid: Annotated[bool, Option("--solid", help="fill the random objects: the group solid")] = HeldoutOptions.solid,
-    rotations: Annotated[
-        int, Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
-    ] = HeldoutOptions.rotations,
-    seed: Annotated[
-        int, Option(help="of scenes and random objects; other than 0: ends the group's name", min=0)
-    ] = HeldoutOptions.seed,
-    device: Device = HeldoutOptions.device,
+    options: HeldoutOptions,
 ) -> None:
     """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
     from stages.lab.dataset.heldout import run
 
-    options = HeldoutOptions(
-        scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        size=size, shapes=shapes, solid=solid, rotations=rotations, seed=seed, device=device,
-    )  # fmt: skip
     print(run(out, options, meshes))
 
 
 @app.command()
+@with_options
 def clutter(
+    *,
     out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
     meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
-    count: SceneCount = ClutterOptions.count,
-    first: Annotated[int, Option(help="number of the first scene")] = ClutterOptions.first,
-    views: Annotated[int, Option(help="photos of each scene")] = ClutterOptions.views,
-    size: Annotated[int, Option(help="longest side of a photo [px]")] = ClutterOptions.size,
-    observations: Annotated[
-        int,
-        Option(
-            help="write this many samples of a reconstruction-noise model per scene instead of photos; 0: write photos"
-        ),
-    ] = ClutterOptions.observations,
-    reconstruct: Annotated[
-        bool,
-        Option(
-            "--reconstruct",
-            help="reconstruct the photos with their true cameras, and write the labelled result instead",
-        ),
-    ] = ClutterOptions.reconstruct,
-    exact: Annotated[
-        bool, Option("--exact", help="write the true Gaussians, labelled, not photos")
-    ] = ClutterOptions.exact,
-    seed: Seed = ClutterOptions.seed,
-    device: Device = ClutterOptions.device,
+    options: ClutterOptions,
 ) -> None:
     """Generate labelled scenes of objects on tables, desks, shelves and floors, to train the segmentation.
 
@@ -262,9 +175,5 @@ def clutter(
     """
     from stages.lab.clutter.scenes import run
 
-    options = ClutterOptions(
-        count=count, first=first, views=views, size=size, observations=observations, reconstruct=reconstruct,
-        exact=exact, seed=seed, device=device,
-    )  # fmt: skip
     for line in run(out, options, meshes):
         print(line, flush=True)

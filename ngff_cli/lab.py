@@ -7,7 +7,16 @@ from typing import Annotated
 from typer import Argument, Option
 
 from ngff_cli import bench, data, training
-from ngff_cli.options import AsJson, Device, SceneIn, Seed, Threads, new_app, print_results, run_command_line, set_up
+from ngff_cli.options import (
+    AsJson,
+    SceneIn,
+    Threads,
+    new_app,
+    print_results,
+    run_command_line,
+    set_up,
+    with_options,
+)
 from stages.lab.bench.motion_options import EstimateOptions, ReplayOptions
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
@@ -33,16 +42,17 @@ def doctor(as_json: AsJson = False) -> None:
 
 
 @app.command()
+@with_options
 def replay(
+    *,
     recording: Annotated[Path, Argument(metavar="RECORDING.npz", help="run of the published MPM solver")],
     out: Annotated[Path, Option("-o", "--out", help="our run to write, as RECORDING")] = Path("ours.npz"),
-    frames: Annotated[int, Option(help="number of frames; 0: all of the recording")] = ReplayOptions.frames,
-    device: Device = ReplayOptions.device,
+    options: ReplayOptions,
 ) -> None:
     """Repeat a recorded run of the published MPM solver with ours and print the differences."""
     from stages.lab.bench.replay import run
 
-    for line in run(recording, out, ReplayOptions(frames=frames, device=device)):
+    for line in run(recording, out, options):
         print(line)
 
 
@@ -61,16 +71,12 @@ def fuzz(
 
 
 @app.command("estimate-materials")
+@with_options
 def estimate_materials(
+    *,
     video: Annotated[Path, Argument(metavar="VIDEO.mp4", help="video of moving objects")],
     out: MaterialsOut = Path("materials.json"),
-    objects: Annotated[
-        str, Option(help="names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
-    ] = EstimateOptions.objects,
-    model: Annotated[
-        str, Option(help="name of a model that accepts images; default: $OPENAI_MODEL")
-    ] = EstimateOptions.model,
-    timeout: Annotated[float, Option(help="maximum waiting time for a reply [s]")] = EstimateOptions.timeout,
+    options: EstimateOptions,
 ) -> None:
     """Estimate the materials of the objects in a video with a vision-language model.
 
@@ -78,12 +84,14 @@ def estimate_materials(
     """
     from stages.lab.bench.estimate_materials import run
 
-    for line in run(video, out, EstimateOptions(objects=objects, model=model, timeout=timeout)):
+    for line in run(video, out, options):
         print(line)
 
 
 @app.command()
+@with_options
 def fit(
+    *,
     scene: SceneIn,
     motion: Annotated[
         list[Path],
@@ -94,32 +102,7 @@ def fit(
         ),
     ],
     out: MaterialsOut = Path("materials.json"),
-    engine: Annotated[str, Option(help="engine that simulates the candidates: auto | rigid | mpm | ngff")] = "auto",
-    quality: Annotated[str, Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
-    material: Annotated[
-        list[str],
-        Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine them; repeatable"),
-    ] = MaterialFitOptions.material,
-    align: Annotated[
-        bool,
-        Option("--align", help="the track has another frame of reference: align it by shared cameras or objects"),
-    ] = MaterialFitOptions.align,
-    rest: Annotated[
-        bool, Option(help="objects of a scene of photos are at rest until something disturbs them")
-    ] = MaterialFitOptions.rest,
-    keypoints: Annotated[int, Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
-    frames: Annotated[int, Option(help="frames of the motion; 0: all")] = MaterialFitOptions.frames,
-    resolution: Annotated[
-        int, Option(help="longest side to which films are reduced [px]")
-    ] = MaterialFitOptions.resolution,
-    noise: Annotated[
-        float, Option(help="standard deviation of the track's errors [scene units]; 0: estimated from it")
-    ] = MaterialFitOptions.noise,
-    evaluations: Annotated[int, Option(help="largest number of simulations")] = MaterialFitOptions.evaluations,
-    minutes: Annotated[float, Option(help="longest time of the search [min]")] = MaterialFitOptions.minutes,
-    workers: Annotated[int, Option(help="processes")] = MaterialFitOptions.workers,
-    seed: Seed = MaterialFitOptions.seed,
-    device: Device = MaterialFitOptions.device,
+    options: MaterialFitOptions,
 ) -> None:
     """Estimate materials and initial velocities of objects from a tracked motion, or from films: SCENE.ply and TRACK.h5
     or FILM.mp4... -> MATERIALS.json.
@@ -130,33 +113,18 @@ def fit(
     """
     from stages.lab.fit.fit import run
 
-    options = MaterialFitOptions(
-        engine=engine, quality=quality, material=tuple(material), align=align, rest=rest, keypoints=keypoints,
-        frames=frames, resolution=resolution, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers,
-        seed=seed, device=device,
-    )  # fmt: skip
     for line in run(scene, motion, out, options):
         print(line)
 
 
 @app.command()
+@with_options
 def track(
+    *,
     scene: SceneIn,
     films: Annotated[Path, Argument(metavar="CAMERAS/", help="folder of the films that the scene was made from")],
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("truth.h5"),
-    resolution: Annotated[
-        int, Option(help="longest side at which frames and renderings are compared [px]")
-    ] = TrackOptions.resolution,
-    frames: Annotated[int, Option(help="frames from the release on; 0: until everything rests")] = TrackOptions.frames,
-    masks: Annotated[
-        Path | None, Option(help="folder with a folder of label images for each film, one for each frame")
-    ] = TrackOptions.masks,
-    soft: Annotated[
-        str, Option(help="names of objects that deform, separated by commas; others are rigid")
-    ] = TrackOptions.soft,
-    keypoints: Annotated[int, Option(help="keypoints per object, in the trajectory")] = TrackOptions.keypoints,
-    seed: Seed = TrackOptions.seed,
-    device: Device = TrackOptions.device,
+    options: TrackOptions,
 ) -> None:
     """Follow the objects of a scene through the films of several cameras: SCENE.ply and CAMERAS/ -> TRUTH.h5.
 
@@ -165,14 +133,14 @@ def track(
     """
     from stages.lab.track.track import run
 
-    options = TrackOptions(resolution=resolution, frames=frames, masks=masks, soft=soft, keypoints=keypoints, seed=seed,
-                           device=device)  # fmt: skip
     for line in run(scene, films, out, options):
         print(line)
 
 
 @app.command()
+@with_options
 def questionnaire(
+    *,
     folder: Annotated[
         Path,
         Argument(
@@ -192,16 +160,15 @@ def questionnaire(
     answers: Annotated[
         list[Path], Option(help="file that a participant returned, or a folder of them; repeatable")
     ] = [],  # noqa: B006
-    participants: Annotated[int, Option(help="number of pages")] = StudyOptions.participants,
-    films: Annotated[int, Option(help="films per page")] = StudyOptions.films,
-    seed: Seed = StudyOptions.seed,
+    options: StudyOptions,
 ) -> None:
     """Write the pages of a user study on which people rate videos, or with --answers the table of their ratings."""
     from stages.lab.questionnaire import answers as table
     from stages.lab.questionnaire import study
 
-    options = StudyOptions(participants=participants, films=films, seed=seed)
-    lines = table.run(folder, answers, out, seed) if answers else study.run(folder, out or Path("study"), options)
+    lines = (
+        table.run(folder, answers, out, options.seed) if answers else study.run(folder, out or Path("study"), options)
+    )
     print("\n".join(lines))
 
 

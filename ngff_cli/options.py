@@ -8,34 +8,28 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import Field, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
-from stages.core.backends import MAX_SEED
 from stages.core.errors import InputError
-from stages.reconstruct.options import QUALITY_PRESETS
 
-QUALITY_HELP = " | ".join(QUALITY_PRESETS)
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda | cuda:N")]
-Seed = Annotated[
-    int, typer.Option(min=0, max=MAX_SEED, help="random seed; the same seed and device give the same result")
-]
 Threads = Annotated[int | None, typer.Option(
     help="CPU threads; default: all cores. With OMP_WAIT_POLICY=ACTIVE in the environment waiting threads spin: faster "
          "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
-SceneCount = Annotated[int, typer.Option(help="number of scenes")]
-Keypoints = Annotated[int, typer.Option(help="keypoints per object")]
+
 Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
 OutKept = Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")]
 OutWithTable = Annotated[
     Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
 ]
-Quality = Annotated[str, typer.Option(help="quality of the reconstruction")]
-Compiled = Annotated[bool, typer.Option("--compiled", help="compile the training step first; for GPUs")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
@@ -52,6 +46,45 @@ class StderrHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print one record."""
         print(self.format(record), file=sys.stderr)
+
+
+def with_options(command: Callable) -> Callable:
+    """The command as typer sees it, with an option for each `option` field of the option classes among its parameters.
+
+    It is called with objects of these classes; a field that several of them have is one option, of the first.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    classes = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    exposed = {name: [f for f in fields(cls) if "help" in f.metadata] for name, cls in classes.items()}
+    parameters: dict[str, Parameter] = {}
+    for name, parameter in signature(command).parameters.items():
+        if name in classes:
+            for f in exposed[name]:
+                parameters.setdefault(f.name, _parameter(f, get_type_hints(classes[name])[f.name]))
+        else:
+            parameters[name] = parameter.replace(annotation=hints[name])
+
+    @wraps(command)
+    def call(**values):
+        given = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        built = {name: cls(**{f.name: given[f.name] for f in exposed[name]}) for name, cls in classes.items()}
+        return command(**{n: v for n, v in values.items() if n in hints and n not in classes}, **built)
+
+    call.__signature__ = Signature(list(parameters.values()))
+    call.__annotations__ = {name: p.annotation for name, p in parameters.items()}
+    return call
+
+
+def _parameter(field: Field, kind: type) -> Parameter:
+    """The parameter that typer makes an option of a field of this type from."""
+    words = dict(field.metadata)
+    flags = words.pop("flags")
+    if kind is bool and field.default is False and not flags:
+        flags = ("--" + field.name.replace("_", "-"),)
+    if get_origin(kind) is tuple:
+        kind = list[get_args(kind)[0]]
+    annotation = Annotated[kind, typer.Option(*flags, **words)]
+    return Parameter(field.name, Parameter.KEYWORD_ONLY, default=field.default, annotation=annotation)
 
 
 def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
@@ -135,6 +168,22 @@ def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None,
         for line in run(path):
             print(line, file=sys.stderr, flush=True)
         print(path.read_text().rstrip())
+
+
+def add_benchmark(
+    app: typer.Typer, name: str, run: str, options: type, help: str, out: Any = Out, default: Path | None = None
+) -> None:
+    """Add the command `name` that prints the results of `run`, a "module:function" of (path, options).
+
+    `out` is the type of its option --out, of this default.
+    """
+
+    def benchmark(*, options, out=default, as_json=False) -> None:
+        print_results(lambda path: load(run)(path, options), out, as_json)
+
+    benchmark.__doc__ = help
+    benchmark.__annotations__ = {"options": options, "out": out, "as_json": AsJson}
+    app.command(name)(with_options(benchmark))
 
 
 class CommandGroup(typer.core.TyperGroup):

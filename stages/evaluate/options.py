@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import option
 
 MAX_FILMS_PER_QUESTION = 26  # films in one question, which have letters as names
 
@@ -14,21 +15,28 @@ MAX_FILMS_PER_QUESTION = 26  # films in one question, which have letters as name
 class EvaluateOptions:
     """Options of the evaluate stage."""
 
-    align: bool = False  # first align the prediction with the truth, by shared cameras or else by objects
-    frames: int | None = None  # compare the first N frames only; by default both must have the same number
-    resample: bool = False  # interpolate the predicted motion at the frame times of the truth
-    objects: str = ""  # names of the objects of the truth to compare: "duck,ball"; default: all
-    undistorted: bool = False  # label images are of the undistorted views, not of the photos as taken
-    photos: Path | None = None  # folder of the photos, for the report; without, those that are labelled are rendered
-    report: Path | None = None  # HTML report with curves and images to write
-    judge: bool = False  # have films scored by a vision-language model, to which frames of them are sent
-    model: str = ""  # that scores; empty: OPENAI_MODEL
-    base_url: str = ""  # of a server with OpenAI's protocol; empty: OPENAI_BASE_URL, or OpenAI's own
-    repeats: int = 3  # scores of each film, each with the films in another random order
-    films_per_question: int = 4  # most films in one question
-    timeout: float = 120.0  # of one question [s]
-    resume: bool = False  # continue an interrupted judgement
-    seed: int = 0  # of the order of the films
+    align: bool = option(False, "first align the prediction with the truth, by shared cameras or objects")
+    frames: int | None = option(None, "compare the first N frames only; default: all, equal in number")
+    resample: bool = option(False, "interpolate the predicted motion at the frame times of the truth")
+    objects: str = option("", "names of the objects to compare, such as duck,ball; default: all")
+    undistorted: bool = option(False, "label images are of undistorted views; default: of the photos as taken")
+    photos: Path | None = option(None, "folder of the photos, for the report of a trajectory or of label images")
+    report: Path | None = option(None, "HTML report with curves and images to write (.html)")
+    judge: bool = option(
+        False,
+        "score films from 0 to 1 by a vision-language model: PhysR and PhotoR. Sends ten frames of "
+        "each film (JPEG, at most 512 px) and nothing else, no names, to $OPENAI_BASE_URL with "
+        "$OPENAI_API_KEY; without --judge nothing is sent anywhere",
+    )
+    model: str = option("", "with --judge: name of a model that accepts images; default: $OPENAI_MODEL")
+    base_url: str = option(
+        "", "with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else OpenAI's own"
+    )
+    repeats: int = option(3, "with --judge: how often each film is scored; mean and standard deviation are given")
+    films_per_question: int = option(4, "with --judge: most films in one question, in random order under letters")
+    timeout: float = option(120.0, "with --judge: maximum waiting time for an answer [s]")
+    resume: bool = option(False, "with --judge: continue an interrupted run, from the answers it has written")
+    seed: int = option(0, "with --judge: random seed of the order of the films")
 
     def __post_init__(self):
         if self.frames is not None and self.frames < 1:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 from stages.reconstruct.scale import parse_scale
 
 BACKENDS = {
@@ -48,24 +49,43 @@ QUALITY_PRESETS = {
 class ReconstructOptions:
     """Options of `ngff reconstruct`; raises InputError for values out of range."""
 
-    sequence: bool = False  # the photos are the first frames of films, in a folder with one for each camera
-    sync: str = "motion"  # of SYNCHRONISATIONS, by which films are aligned in time
-    offsets: str = ""  # of the films in place of that: "A.mp4=0,B.mp4=3.33" [frames]
-    fps: float = 50.0  # frames a second of folders of frames
-    backend: str = "classic"
-    matcher: str = "sift"  # of features, for the classic backend
-    cameras: Path | None = None  # known cameras: a nerfstudio transforms.json or a COLMAP model folder
-    holdout: int = 0  # keep every N-th photo out of the fit and evaluate it; 0 for none
-    quality: str = "normal"
-    resolution: int | None = None  # longest side of the views [px]; by default that of the quality
-    up: str = "auto"  # side of the photos that is up: auto, or one of UP_SIDES
-    scale_reference: str = ""  # a measured length, in the form of scale.parse_scale; empty for none
-    resume: bool = False  # continue an interrupted run from its finished steps
-    weights: Path | None = None  # of pi3 and pi3-splat: a file or a folder; by default searched for
-    download: bool = False  # download those weights if they are missing
-    iterations: int | None = None  # of the photometric fit, 0 for none; by default that of the quality
-    seed: int = 0
-    device: str = "auto"
+    sequence: bool = option(
+        False,
+        "PHOTOS has a video, or a folder of frames, for each of several fixed cameras: reconstruct "
+        "the moment at which the objects are released",
+    )
+    sync: str = option("motion", "with --sequence, how films are aligned in time: " + " | ".join(SYNCHRONISATIONS))
+    offsets: str = option(
+        "", 'with --sequence, in place of --sync: the frame of each film at one moment, "A.mp4=0,B.mp4=3.33"'
+    )
+    fps: float = option(50.0, "with --sequence: frames a second of folders of frames")
+    backend: str = option("classic", " | ".join(BACKENDS))
+    matcher: str = option(
+        "sift",
+        "features matched between photos: "
+        + " | ".join(FEATURE_EXTRACTORS)
+        + "; the learned ones match photos with little overlap",
+    )
+    cameras: Path | None = option(None, "known cameras: transforms.json or a COLMAP model folder; default: estimated")
+    holdout: int = option(0, "hold out every N-th photo and report PSNR and SSIM on it; 0: none")
+    quality: str = option("normal", " | ".join(QUALITY_PRESETS))
+    resolution: int | None = option(None, "longest side to which photos are resized [px]; default: set by --quality")
+    up: str = option(
+        "auto", "side of the photos that is up: auto (by the table or floor) | top | right | bottom | left"
+    )
+    scale_reference: str = option(
+        "",
+        'a known length [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or '
+        '"distance=0.6" from the cameras to the point they look at',
+    )
+    resume: bool = option(False, "continue an interrupted run after its last finished step")
+    weights: Path | None = option(
+        None, "weights of pi3 or pi3-splat (.safetensors, .pth); default: searched in $NGFF_WEIGHTS and ~/.cache/ngff"
+    )
+    download: bool = option(False, "download missing weights (CC BY-NC; needs the extra hub)")
+    iterations: int | None = option(None, "photometric optimisation steps, 0 for none; default: set by --quality")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if self.matcher not in FEATURE_EXTRACTORS:

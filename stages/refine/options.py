@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.core.backends import Backend, with_weights
+from stages.core.backends import Backend, describe, with_weights
 from stages.core.errors import InputError
+from stages.core.options import device_option, download_option, option, photos_option, seed_option
 
 # a completer takes (scene, object id, ObservedSpace, Support | None, RefineOptions) and returns Gaussians to add
 BACKENDS = {
@@ -36,19 +37,19 @@ CONCURRENT = {"close", "none"}  # completers of which several run at a time: the
 class RefineOptions:
     """Parameters of refinement; raises InputError for values outside their range and for conflicting ones."""
 
-    completer: str = "close"  # --library selects its own
-    library: Path | None = None  # folder of whole objects, each a .ply or a folder with one
-    photos: Path | None = None  # folder of the scene's photos, for generators; by default the scene is rendered
-    weights: Path | None = None  # folder of a generator's weights; by default searched
-    download: bool = False  # download missing weights
-    upscale: str = "none"  # of UPSCALERS: super-resolution of the image that DiffSplat gets
-    matcher: str = "none"  # of MATCHERS: poses of whole objects also by learned matches of images
-    keep_raw: bool = False  # of K objects, keep the uncompleted ones as K + 1 to 2 K
-    outliers: float = 3.0  # robust deviations beyond which a Gaussian is a floater; 0 keeps all
-    background: bool = True  # fill the table under and behind objects
-    resolution: int = 48  # cells along an object's longest side for the completer "close"
-    seed: int = 0
-    device: str = "auto"
+    completer: str = option("close", describe(BACKENDS))
+    library: Path | None = option(None, "folder of complete objects (.ply); the best match replaces a partial object")
+    photos: Path | None = photos_option(GENERATORS)
+    weights: Path | None = option(None, f"for {GENERATORS}: folder of its weights; default: searched in $NGFF_WEIGHTS")
+    download: bool = download_option(GENERATORS)
+    upscale: str = option("none", f"for {GENERATORS}, super-resolution of the object's image; {describe(UPSCALERS)}")
+    matcher: str = option("none", f"to register whole objects, by a photo and renderings: {' | '.join(MATCHERS)}")
+    keep_raw: bool = option(False, "also keep the K objects unrefined, with ids K+1 to 2K")
+    outliers: float = option(3.0, "outlier threshold [robust standard deviations]; 0 keeps all Gaussians")
+    background: bool = option(True, "fill the table under and behind objects")
+    resolution: int = option(48, "voxels along an object's longest side when unseen surfaces are closed")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if self.completer == "library" and self.library is None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option
 from stages.core.scene.formats import suffixes
 
 VIEWS = "novel | orbit | input:K | all | path.json"
@@ -28,18 +29,24 @@ OUTPUT_FORMATS = {
 class RenderOptions:
     """Options of the render stage."""
 
-    view: str = "novel"  # one of VIEWS; K is an index from 0 or the name of a photo
-    resolution: int = 640  # longest side of a view [px]; an image of many views is about twice as wide
-    fps: float | None = None  # frames per second, at unchanged speed of motion; default: the trajectory's
-    background: str | None = None  # scene.ply, #rrggbb or a photo that replaces the scene's own background
-    depth: bool = False  # render depth: colour-coded in a video, 16 bit in a PNG
-    ids: bool = False  # render each object in one flat colour, with its number and a legend
-    shadows: str = "on"  # on | off: soft shadows of objects that moved
-    show_forces: bool = False  # draw an arrow for each active force prompt
-    playable: bool = False  # a page that continues the motion by the learned field when the user grabs an object
-    frame: int | None = None  # render this frame only; -1 is the last
-    side_by_side: bool = False  # several files in one image, with the same camera
-    device: str = "auto"
+    view: str = option("novel", f"camera: {VIEWS}")
+    resolution: int = option(640, "longest side of a view [px]")
+    fps: float | None = option(
+        None, "frames per second, at unchanged speed of motion; default: the trajectory's, 30 for a scene"
+    )
+    background: str | None = option(None, "scene.ply, #rrggbb or a photo that replaces the scene's own background")
+    depth: bool = option(False, "render depth: colour-coded in MP4, 16 bit in PNG")
+    ids: bool = option(False, "render each object in one flat colour, with its number and a legend")
+    shadows: str = option("on", "soft shadows of objects that moved: on | off")
+    show_forces: bool = option(False, "draw an arrow for each active force prompt")
+    playable: bool = option(
+        False,
+        "with -o film.html: objects can be dragged, pushed and lifted in the page, which computes "
+        "their motion (trajectories of --engine ngff --contact learned)",
+    )
+    frame: int | None = option(None, "render this frame only, from 0; -1 is the last; default: all")
+    side_by_side: bool = option(False, "render several files in one image, with the same camera")
+    device: str = device_option()
 
     def __post_init__(self):
         kind = self.view.partition(":")[0]

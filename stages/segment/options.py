@@ -6,8 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.core.backends import Backend, with_weights
+from stages.core.backends import Backend, describe, with_weights
 from stages.core.errors import InputError
+from stages.core.options import device_option, download_option, option, photos_option, seed_option
 from stages.core.perception.object_limits import GroupingOptions
 from stages.segment.object_scale import parse_object_scale
 
@@ -33,21 +34,41 @@ NETWORKS = with_weights(BACKENDS)
 class SegmentOptions:
     """Parameters of segmentation; raises InputError for values outside their range and for conflicting ones."""
 
-    backend: str = "learned"  # --masks and --boxes select their own backend, unless this is a network
-    masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
-    boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first photo
-    points: tuple[str, ...] = ()  # "view=a.jpg xy=310,220 name=duck", see points.py
-    photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
-    undistorted: bool = False  # masks, boxes and photos are in pixels of the undistorted views, not of photos as taken
-    weights: Path | None = None  # of `learned`: segmenter.safetensors; of others: model.safetensors and config.json
-    download: bool = False  # download missing weights
-    names: str = ""  # "1=duck,2=bowl": replaces the automatic names
-    max_objects: int = GroupingOptions.max_objects
-    min_size: float = GroupingOptions.min_size
-    detail: float = GroupingOptions.detail
-    scale_reference: str = ""  # "object=1 height=0.12": a measured length [m]
-    seed: int = 0
-    device: str = "auto"
+    backend: str = option("learned", describe(BACKENDS))
+    masks: Path | None = option(
+        None,
+        "folder of label images named as the photos: 0 background, 1... objects; 255 is ignored "
+        "where its names.json does not name it",
+    )
+    boxes: Path | None = option(
+        None, f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points"
+    )
+    points: tuple[str, ...] = option(
+        (),
+        'a point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; repeatable; '
+        "points of one name are on one object",
+    )
+    photos: Path | None = photos_option(NETWORKS)
+    undistorted: bool = option(
+        False, "masks, boxes and photos are of undistorted views; default: of the photos as taken"
+    )
+    weights: Path | None = option(
+        None,
+        f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
+        "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours",
+    )
+    download: bool = download_option(NETWORKS)
+    names: str = option("", 'object names: "1=duck,2=bowl"')
+    max_objects: int = option(GroupingOptions.max_objects, "maximum number of objects")
+    min_size: float = option(
+        GroupingOptions.min_size, "ignore objects whose longest side is below this fraction of the camera distance"
+    )
+    detail: float = option(
+        GroupingOptions.detail, "backend geometric: merge threshold of regions, 0 to 2; lower values give more objects"
+    )
+    scale_reference: str = option("", 'a length measured on an object [m]: "object=1 height=0.12" (or length=)')
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if (self.masks is not None) + (self.boxes is not None) + bool(self.points) > 1:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 
 
 @dataclass(frozen=True)
@@ -61,31 +62,51 @@ QUALITIES = {
 class SimulateOptions:
     """Options of `ngff simulate`. Raises InputError for values out of range."""
 
-    steps: int = 100  # frames, the first being the start
-    dt: float = 0.02  # time between frames [s]
-    engine: str = AUTO
-    gravity: float = STANDARD_GRAVITY  # downwards [m/s^2]
-    quality: str = "normal"
-    material: tuple[str, ...] = ()  # OBJECT=MATERIAL
-    materials: Path | None = None  # JSON {object name or id: material name or {E, nu, density, friction}}
-    force: tuple[str, ...] = ()  # "object=2 force=0,0,8 from=0.1 to=0.3"; also torque= and at= (point of application)
-    forces: Path | None = None  # JSON in the format of NGFF, whose obj_id 0 is object 1, or a recording to be repeated
-    pin: tuple[str, ...] = ()  # objects held at their position
-    velocity: tuple[str, ...] = ()  # "object=1 0,0,2" at the start [scene units/s]
-    lift: tuple[str, ...] = ()  # HEIGHT for all or OBJECT=HEIGHT [scene units]
-    floor: float | None = None  # height of the floor [scene units]; by default the scene's
-    friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
-    box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default only a floor
-    keypoints: int | None = None  # maximum number per object; None: see keypoint_count
-    weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
-    integrator: str = "step"  # of a learned engine, one of INTEGRATORS
-    contact: str = AUTO  # of the engine ngff, one of CONTACTS; AUTO: see engine_choice.py
-    rest: bool = True  # hold objects of photos until something acts on them
-    live: bool = False  # in real time, with a page in the browser to act on the objects
-    browser: bool = True  # whether --live opens it
-    port: int = 0  # of --live on 127.0.0.1; 0: any free one
-    seed: int = 0
-    device: str = "auto"
+    steps: int = option(100, "number of frames, including the initial state")
+    dt: float = option(0.02, "time between frames [s]")
+    engine: str = option(AUTO, ENGINE_HELP)
+    gravity: float = option(STANDARD_GRAVITY, "downward acceleration [m/s^2]")
+    quality: str = option("normal", " | ".join(QUALITIES))
+    material: tuple[str, ...] = option((), "OBJECT=MATERIAL, such as duck=rubber; repeatable")
+    materials: Path | None = option(None, "JSON: object name or id to a material's name or {E, nu, density, friction}")
+    force: tuple[str, ...] = option((), '"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
+    forces: Path | None = option(
+        None,
+        "JSON of forces {scene: [{obj_id, start, end, force}]}; or a trajectory (.h5), or JSON saved "
+        "by a playable page, whose forces, changes and options are repeated",
+    )
+    pin: tuple[str, ...] = option((), "object held fixed; repeatable")
+    velocity: tuple[str, ...] = option((), 'initial velocity: "object=1 0,0,2" [scene units/s]; repeatable')
+    lift: tuple[str, ...] = option((), "initial lift: HEIGHT for all, or OBJECT=HEIGHT [scene units]; repeatable")
+    floor: float | None = option(None, "height of the floor [scene units]; default: the scene's")
+    friction: float | None = option(None, "Coulomb coefficient at floor and walls; default: each material's")
+    box: str | None = option(None, "floor, walls and ceiling x0,y0,z0,x1,y1,z1 [scene units]; default: only a floor")
+    keypoints: int | None = option(
+        None, f"maximum number of keypoints per object; default: {DEFAULT_KEYPOINTS}, with --live {LIVE_KEYPOINTS}"
+    )
+    weights: Path | None = option(
+        None,
+        "weights of the learned engine (.safetensors with its card, or a published .pth); default: "
+        "those in the package",
+    )
+    integrator: str = option("step", "learned engine: step (the model's own) or an ODE solver: euler | rk4 | dopri5")
+    contact: str = option(
+        AUTO, "engine ngff: learned, for soft bodies | solved, with the materials' friction and rebound | auto"
+    )
+    rest: bool = option(
+        True,
+        "engines rigid and ngff: hold objects of photos until something acts on them, or let them "
+        "fall from where they are, as in photos of a moment",
+    )
+    live: bool = option(
+        False,
+        "simulate in real time and open a page to drag, push, lift and pin the objects; Ctrl-C ends "
+        "and writes what was recorded",
+    )
+    browser: bool = option(True, "with --live: open the page, or only print its address")
+    port: int = option(0, "with --live: port on 127.0.0.1; 0: any free one")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if self.integrator not in INTEGRATORS:

@@ -10,7 +10,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-CORE = ["errors", "backends", "geometry", "scene", "kernels", "raster", "perception", "physics", "models", "player"]
+CORE = [
+    "errors",
+    "backends",
+    "options",
+    "geometry",
+    "scene",
+    "kernels",
+    "raster",
+    "perception",
+    "physics",
+    "models",
+    "player",
+]
 STAGES = {"reconstruct", "segment", "refine", "simulate", "render", "evaluate"}
 HEAVY = {"torch", "warp", "cv2", "pycolmap", "h5py", "numpy"}  # packages that take long to import
 

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from stages.core.backends import load
 from stages.core.errors import InputError
+from stages.core.options import option
 from stages.lab.names import chosen_names
 
 if TYPE_CHECKING:
@@ -59,10 +60,10 @@ ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of th
 class ObjectsOptions:
     """Which objects to write, and how meshes are converted to Gaussians."""
 
-    only: str = ""  # names separated by commas; empty: all ten
-    count: int = 40_000  # approximate number of Gaussians of a mesh
-    up: str = "auto"  # axis of a mesh that points up
-    light: bool = True  # bake soft light into the colours of a mesh
+    only: str = option("", "names of the objects, such as ball,duck; default: all ten")
+    count: int = option(40_000, "approximate number of Gaussians of a mesh")
+    up: str = option("auto", "up axis of a mesh: auto | x | y | z")
+    light: bool = option(True, "bake soft light into the colours of a mesh")
 
 
 def make_object(name: str) -> Gaussians:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 from stages.lab.names import chosen_names
 from stages.reconstruct.options import QUALITY_PRESETS
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
@@ -16,13 +17,13 @@ FILM_KINDS = ("slide", "throw")
 class PhysicsBenchOptions:
     """What is measured, with which engines."""
 
-    only: str = ""  # groups or patterns of names, such as "slide,tower/3*"; empty: all
-    engines: tuple[str, ...] = ("rigid", "mpm", "ngff")
-    quality: str = "draft"  # of MPM
-    keypoints: int = 256
-    weights: Path | None = None  # of the learned engine
-    contact: str = AUTO  # of the engine ngff
-    device: str = "auto"
+    only: str = option("", "experiments by group or pattern, such as slide,'boxes/0.3m*'; default: all")
+    engines: tuple[str, ...] = option(("rigid", "mpm", "ngff"), "auto | rigid | mpm | ngff; repeatable", "--engine")
+    quality: str = option("draft", "quality of MPM: draft | normal | high")
+    keypoints: int = option(256, "keypoints per object")
+    weights: Path | None = option(None, "weights of the learned engine; default: those in the package")
+    contact: str = option(AUTO, "contacts of the engine ngff: auto | learned | solved")
+    device: str = device_option()
 
     def __post_init__(self):
         unknown = [name for name in self.engines if name not in (AUTO, *ENGINES)]
@@ -35,12 +36,12 @@ class PhysicsBenchOptions:
 class DynamicsBenchOptions:
     """Scenes, keypoints and the optional MPM row."""
 
-    keypoints: int = 256  # of an object; a model gets no more than it was trained with
-    limit: int = 0  # scenes of each split; 0: all
-    mpm: int = 100  # scenes of each split for mpm-estimated, which simulates them; 0: no such row
+    keypoints: int = option(256, "keypoints per object")
+    limit: int = option(0, "scenes of each split; 0: all")
+    mpm: int = option(100, "scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
     batch: int = 100  # scenes at once
     seed: int = 0  # of the temporal sample
-    device: str = "auto"
+    device: str = device_option()
 
     def __post_init__(self):
         if self.keypoints < 1 or self.batch < 1 or min(self.limit, self.mpm) < 0:
@@ -51,27 +52,31 @@ class DynamicsBenchOptions:
 class AblationBenchOptions:
     """Length and data of each training."""
 
-    steps: int = 1500
-    batch: int = 64
-    keypoints: int = 256
-    horizons: str = "8,20"
-    groups: str = "3_0..3_8"  # to train on; the last 100 scenes are for validation
-    test: str = "3_9"  # group to score on
-    compiled: bool = False
-    seed: int = 0
-    device: str = "auto"
+    steps: int = option(1500, "training steps of each ablation")
+    batch: int = option(64, "scenes per training step")
+    keypoints: int = option(256, "keypoints per object")
+    horizons: str = option("8,20", "rollout length of each training phase [frames]")
+    groups: str = option("3_0..3_8", "groups of scenes to train on")
+    test: str = option("3_9", "group of scenes to test on")
+    compiled: bool = option(False, "compile the training step first; for GPUs")
+    seed: int = seed_option()
+    device: str = device_option()
 
 
 @dataclass(frozen=True)
 class TrackBenchOptions:
     """Which stand-ins are filmed and tracked."""
 
-    sequences: int = 5
-    first: int = 0  # seed of the first sequence
-    width: int = 240  # of the films [px]
-    frames: int = 50
-    quality: str = ""  # at which scenes are reconstructed from their films; empty: the true scene is tracked
-    device: str = "auto"
+    sequences: int = option(5, "number of sequences")
+    first: int = option(0, "seed of the first sequence")
+    width: int = option(240, "width of the videos [px]")
+    frames: int = option(50, "frames of motion")
+    quality: str = option(
+        "",
+        "track scenes reconstructed from the videos at this quality and segmented; default: true scenes",
+        "--reconstructed",
+    )
+    device: str = device_option()
 
     def __post_init__(self):
         if self.sequences < 1 or self.frames < 20 or not 64 <= self.width <= 4096:
@@ -84,15 +89,15 @@ class TrackBenchOptions:
 class FitBenchOptions:
     """Scenes, and how each is fitted."""
 
-    scenes: int = 20  # of the kinds in turn
-    only: str = ""  # some of FIT_KINDS, separated by commas; empty: all
-    truth: str = ""  # engine of the motions; empty: that which fits them
-    noise: float = 0.002  # of the track [m]
-    evaluations: int = 1500
-    minutes: float = 10.0  # for a scene
-    workers: int = 2
-    seed: int = 0
-    device: str = "auto"
+    scenes: int = option(20, "number of scenes")
+    only: str = option("", "some of slide,bounce,collision,soft, alternating; default: all four")
+    truth: str = option("", "engine of the motions; default: that which fits them")
+    noise: float = option(0.002, "standard deviation of the tracks' errors [m]")
+    evaluations: int = option(1500, "largest number of simulations of a scene")
+    minutes: float = option(10.0, "longest time of a scene [min]")
+    workers: int = option(2, "processes")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         chosen_names(self.only, FIT_KINDS)
@@ -104,14 +109,14 @@ class FitBenchOptions:
 class FilmBenchOptions:
     """What is filmed, and how it is fitted."""
 
-    scenes: int = 6  # of the kinds in turn
-    only: str = ""  # some of FILM_KINDS; empty: both
-    films: int = 2  # of each scene
-    width: int = 320  # of the films [px]
-    frames: int = 25
-    workers: int = 2
-    seed: int = 0  # of the first scene
-    device: str = "auto"
+    scenes: int = option(6, "number of scenes")
+    only: str = option("", "slide or throw; default: both, alternating")
+    films: int = option(2, "films per scene")
+    width: int = option(320, "width of the films [px]")
+    frames: int = option(25, "frames of each film")
+    workers: int = option(2, "processes")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         chosen_names(self.only, FILM_KINDS)
@@ -123,8 +128,8 @@ class FilmBenchOptions:
 class ReplayOptions:
     """Length and device of the run."""
 
-    frames: int = 0  # of the recording, the first counted; 0: all
-    device: str = "auto"
+    frames: int = option(0, "number of frames; 0: all of the recording")
+    device: str = device_option()
 
     def __post_init__(self):
         if self.frames < 0:
@@ -135,9 +140,9 @@ class ReplayOptions:
 class EstimateOptions:
     """Model, frames shown, and number of attempts."""
 
-    objects: str = ""  # names separated by commas, or a scene.ply that holds them; empty: the model names the objects
-    model: str = ""  # empty: OPENAI_MODEL
-    timeout: float = 120.0  # of one request [s]
+    objects: str = option("", "names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
+    model: str = option("", "name of a model that accepts images; default: $OPENAI_MODEL")
+    timeout: float = option(120.0, "maximum waiting time for a reply [s]")
     frames: int = 10  # evenly spaced
     longest: int = 512  # longest side of a frame as sent [px]
     tries: int = 3  # replies, before giving up

@@ -96,7 +96,7 @@ def batch_size(particles: int, device: str) -> int:
     return max(1, min(room, math.ceil(3_000_000 / particles)))
 
 
-def run(options: MpmBenchOptions, out: Path | None = None) -> Iterator[str]:
+def run(out: Path | None, options: MpmBenchOptions) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     from stages.core.backends import pick_device
 

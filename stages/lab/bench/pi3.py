@@ -60,9 +60,9 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
 
 
 def run(
+    out: Path | None,
     options: Pi3BenchOptions,
     config: Pi3Config = Pi3Config(),  # noqa: B008 -- frozen
-    out: Path | None = None,
 ) -> Iterator[str]:
     """Yield for each number of views a line with time, memory and its estimate, and one with unfused attention."""
     device = pick_device(options.device)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 from stages.reconstruct.options import ReconstructOptions
 
 
@@ -13,11 +14,11 @@ from stages.reconstruct.options import ReconstructOptions
 class ReconstructBenchOptions:
     """Options of the reconstruction."""
 
-    quality: str = "normal"
-    holdout: int = 8
-    device: str = "auto"
-    matcher: str = "sift"
-    cameras_only: bool = False  # stop after the cameras, to compare matchers
+    quality: str = option("normal", "quality of the reconstruction")
+    holdout: int = option(8, "hold out every N-th photo")
+    device: str = device_option()
+    matcher: str = option("sift", "features matched between photos: sift | aliked-lightglue")
+    cameras_only: bool = option(False, "stop after the cameras are estimated, to compare matchers")
 
     def key(self, folder: Path) -> str:
         """Name of a set's row in the results."""
@@ -30,9 +31,9 @@ class ReconstructBenchOptions:
 class AppearanceBenchOptions:
     """Options of the reconstruction."""
 
-    quality: str = "high"
-    holdout: int = 8
-    models: Path | None = None  # cache of each set's cameras and sparse points; None: estimate them
+    quality: str = option("high", "quality of the reconstruction")
+    holdout: int = option(8, "hold out every N-th photo")
+    models: Path | None = option(None, "folder in which cameras and sparse points are cached between runs")
 
     def __post_init__(self):
         if self.holdout < 2:
@@ -48,11 +49,11 @@ class AppearanceBenchOptions:
 class SegmentBenchOptions:
     """Scenes and methods; two scenes show all ten objects."""
 
-    scenes: int = 4  # of each arrangement
-    views: int = 24  # cameras of a scene
-    weights: Path | None = None  # of SAM 2.1; None: the default locations
-    device: str = "auto"  # of SAM 2.1
-    reconstruct: bool = False  # also from rendered photos: minutes per scene
+    scenes: int = option(4, "scenes of each kind: separate objects, and objects in contact")
+    views: int = option(24, "number of cameras per scene")
+    weights: Path | None = option(None, "weights of network backends; default: searched; without any, they are skipped")
+    device: str = device_option()
+    reconstruct: bool = option(False, "also segment scenes reconstructed from photos, by geometry and by the network")
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
@@ -63,21 +64,25 @@ class SegmentBenchOptions:
 class SegmentPhotosOptions:
     """Where labels and ready scenes are."""
 
-    labels: Path | None = None  # folder of label images, or of such folders named as the sets; default: SET/labels
-    labelled: Path | None = None  # folder of labelled scenes SET.ply: used where present, otherwise made and kept there
-    device: str = "auto"  # of the reconstruction
+    labels: Path | None = option(
+        None, "of photo sets: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
+    )
+    labelled: Path | None = option(
+        None, "of photo sets: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"
+    )
+    device: str = device_option()
 
 
 @dataclass(frozen=True)
 class SegmentAblationOptions:
     """Length of the trainings."""
 
-    steps: int = 1500
+    steps: int = option(1500, "training steps of each network")
     voxels: int = 14_000
-    batch: int = 4
-    workers: int = 0
-    seed: int = 0
-    device: str = "auto"
+    batch: int = option(4, "crops per step")
+    workers: int = option(0, "processes that prepare crops; 0: the training process itself")
+    seed: int = seed_option()
+    device: str = device_option()
 
 
 @dataclass(frozen=True)
@@ -93,8 +98,8 @@ class SegmentAblationData:
 class RefineBenchOptions:
     """Number of scenes and of cameras of each."""
 
-    scenes: int = 4
-    views: int = 24
+    scenes: int = option(4, "number of scenes of separate objects")
+    views: int = option(24, "number of cameras per scene")
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
@@ -105,23 +110,27 @@ class RefineBenchOptions:
 class RegisterBenchOptions:
     """Objects, number of trials and the damage to each part."""
 
-    only: str = ""  # names separated by commas; empty: all ten objects
-    trials: int = 10  # parts of each object
+    only: str = option("", "names of the objects, such as ball,duck; default: all ten")
+    trials: int = option(10, "partial views of each object")
     missing: float = 0.4  # fraction of the surface
     noise: float = 0.01  # standard deviation of positions [diameters]
     tint: float = 0.02  # standard deviation of colours [0..1]
-    seed: int = 0
-    device: str = "auto"  # of the Gaussians
+    seed: int = seed_option()
+    device: str = device_option()
 
 
 @dataclass(frozen=True)
 class CompleteBenchOptions:
     """Scenes, noise and simulation of the benchmark."""
 
-    scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # objects of each scene
-    known: str = ""  # objects of the library; empty: all ten
+    scenes: tuple[str, ...] = option(
+        ("panda,duck", "can,miku", "bowl,phone"),
+        "names of the objects of a scene, separated by commas; repeatable",
+        "--scene",
+    )
+    known: str = option("", "names of the objects in the library; default: all ten")
     thin: int = 2  # every n-th Gaussian of an object is used
     noise: float = 0.003  # standard deviation of positions [longest sides]
     frames: int = 40  # frames of motion
     lift: float = 0.2  # height that the objects are dropped from [m]
-    seed: int = 0
+    seed: int = seed_option()

@@ -4,16 +4,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option
 
 
 @dataclass(frozen=True)
 class MpmBenchOptions:
     """Problem sizes; a batch is `scenes` copies of one scene."""
 
-    device: str = "auto"
-    particles: tuple[int, ...] = (6_144, 20_000, 250_000)
-    scenes: int = 0  # 0: as many as suit the device
-    frames: int = 10  # timed, after three of warm-up
+    device: str = device_option()
+    particles: tuple[int, ...] = option((6_144, 20_000, 250_000), "particles per scene; repeatable")
+    scenes: int = option(0, "scenes per batch; 0: chosen for the device")
+    frames: int = option(10, "frames of 200 substeps to time")
 
     def __post_init__(self):
         if self.frames < 1 or self.scenes < 0 or not all(100 <= p <= 2_000_000 for p in self.particles):
@@ -24,8 +25,8 @@ class MpmBenchOptions:
 class RasterBenchOptions:
     """Repetitions and problem size."""
 
-    repeat: int = 15  # timed calls of each, of which the fastest counts
-    shrink: int = 1  # divides the numbers of Gaussians and pixels
+    repeat: int = option(15, "timed calls of each; the fastest counts")
+    shrink: int = option(1, "factor by which the numbers of Gaussians and pixels are reduced")
 
     def __post_init__(self):
         if not 1 <= self.repeat <= 1000 or not 1 <= self.shrink <= 100:
@@ -36,11 +37,11 @@ class RasterBenchOptions:
 class Pi3BenchOptions:
     """Numbers of views, image size and repetitions."""
 
-    device: str = "auto"
-    views: tuple[int, ...] = (1, 8, 20, 50)
-    size: int = 448  # side of the square photos [px]
-    repeat: int = 3  # timed forward passes of each
-    splats: bool = False  # with the Gaussian head
+    device: str = device_option()
+    views: tuple[int, ...] = option((1, 8, 20, 50), "photos per pass; repeatable")
+    size: int = option(448, "side of the photos, a multiple of 14 [px]")
+    repeat: int = option(3, "timed passes of each")
+    splats: bool = option(False, "include the Gaussian head")
 
     def __post_init__(self):
         from stages.core.models.pi3.dinov2 import PATCH  # imports PyTorch, which --help does not wait for
@@ -53,13 +54,13 @@ class Pi3BenchOptions:
 class RolloutBenchOptions:
     """Model and size of the rollouts."""
 
-    weights: Path | None = None  # of our force field; None: the shipped ones
-    objects: int = 3  # of a scene
-    keypoints: int = 2048  # of an object
-    steps: int = 100
-    scenes: tuple[int, ...] = ()  # batch sizes; empty: 1 and, on a GPU, 64
-    repeat: int = 5  # timed rollouts, of which the median counts
-    device: str = "auto"
+    weights: Path | None = option(None, "weights of the force field (.safetensors); default: those in the package")
+    objects: int = option(3, "objects of a scene, in piles of three")
+    keypoints: int = option(2048, "keypoints of each object")
+    steps: int = option(100, "number of 0.02 s steps")
+    scenes: tuple[int, ...] = option((), "scenes per batch; repeatable; default: 1, and 64 on a GPU")
+    repeat: int = option(5, "timed rollouts, of which the median counts")
+    device: str = device_option()
 
     def __post_init__(self):
         if min((self.objects, self.keypoints, self.steps, self.repeat, *self.scenes)) < 1:
@@ -70,12 +71,12 @@ class RolloutBenchOptions:
 class ChainBenchOptions:
     """What is run."""
 
-    quality: str = "normal"
-    device: str = "auto"
-    steps: int = 100  # frames of the film
-    refine: bool = True
-    repeat: int = 2  # runs in this process; the first one loads kernels
-    commands: bool = True  # also run each stage as a command
+    quality: str = option("normal", "quality of the reconstruction")
+    device: str = device_option()
+    steps: int = option(100, "frames of the video")
+    refine: bool = option(True, "complete the objects before they are simulated")
+    repeat: int = option(2, "runs in one process; the first one loads kernels")
+    commands: bool = option(True, "also run each stage as a command")
 
     def __post_init__(self):
         if not 1 <= self.repeat <= 100:
@@ -89,10 +90,10 @@ class ChainTableOptions:
     objects: tuple[int, ...] = (3, 6)
     photos: int = 20
     width: int = 448  # of the photos [px]
-    quality: str = "normal"
-    steps: int = 100  # frames of the film
-    repeat: int = 2  # of which the last one counts: the first one loads kernels
-    device: str = "auto"
+    quality: str = option("normal", "quality of the reconstruction")
+    steps: int = option(100, "frames of the video")
+    repeat: int = option(2, "runs in one process; the first one loads kernels")
+    device: str = device_option()
 
     def __post_init__(self):
         if not 1 <= self.repeat <= 100 or self.photos < 4 or not 64 <= self.width <= 4096:

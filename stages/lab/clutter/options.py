@@ -3,21 +3,26 @@
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 
 
 @dataclass(frozen=True)
 class ClutterOptions:
     """How many scenes, and what they are made of."""
 
-    count: int = 20
-    first: int = 0  # number of the first scene, which decides its content together with the seed
-    views: int = 12  # photos of each scene
-    size: int = 512  # longest side of the photos [px]
-    observations: int = 0  # by the noise model, in place of photos and the true scene; 0: photos to reconstruct
-    reconstruct: bool = False  # write an observation of the reconstructed photos, in place of them and the true scene
-    exact: bool = False  # write an observation of the true Gaussians, in place of photos
-    seed: int = 0
-    device: str = "auto"  # of the reconstruction
+    count: int = option(20, "number of scenes")
+    first: int = option(0, "number of the first scene")
+    views: int = option(12, "photos of each scene")
+    size: int = option(512, "longest side of a photo [px]")
+    observations: int = option(
+        0, "write this many samples of a reconstruction-noise model per scene instead of photos; 0: write photos"
+    )
+    reconstruct: bool = option(
+        False, "reconstruct the photos with their true cameras, and write the labelled result instead"
+    )
+    exact: bool = option(False, "write the true Gaussians, labelled, not photos")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if self.count < 1 or not 4 <= self.views <= 200 or not 64 <= self.size <= 4096 or self.observations < 0:

@@ -61,7 +61,7 @@ class DatasetGenerator:
 
     def __init__(self, out: Path, options: DatasetOptions):
         materials = [(kind.E, kind.density) for kind in objects.OBJECTS.values()]
-        self.options = replace(options, substep=stable_substep(options.discretisation, materials))
+        self.options = replace(options, substep=stable_substep(options, materials))
         self.layout, self.device = Layout(out), pick_device(options.device)
         out.mkdir(parents=True, exist_ok=True)
         manifest.open_manifest(out, self.options.settings)
@@ -69,7 +69,7 @@ class DatasetGenerator:
     @cached_property
     def assets(self) -> dict[int, Asset]:
         """The objects of the data set as particles, by id; made or read on first use."""
-        return load_assets(self.options.discretisation, self.options.keypoints, self.layout.root / "particles.npz")
+        return load_assets(self.options, self.options.keypoints, self.layout.root / "particles.npz")
 
     @cached_property
     def scene_assets(self) -> SceneAssets:
@@ -131,7 +131,7 @@ class DatasetGenerator:
         path.parent.mkdir(exist_ok=True)
         configs, start, count = self._configs(group), time.perf_counter(), 0
         made_by = provenance("dataset", [self.layout.config(group)], o)
-        settings = SimulationSettings(o.discretisation, o.frames, o.keypoints, self.device, o.deterministic)
+        settings = SimulationSettings(o, o.frames, o.keypoints, self.device, o.deterministic)
         bar = tqdm(total=len(configs), desc=group, unit="scene")
         with bar, KeypointMotionsWriter(path, made_by) as writer:
             for batch in simulate(configs, self.assets, settings):

@@ -57,12 +57,12 @@ def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) ->
     objects = find_objects(meshes or [])
     assets = _assets(options, objects, Path(out) / f"particles_{name}.npz")
     materials = [(asset.E, asset.density) for asset in assets.values()]
-    options = replace(options, substep=stable_substep(options.discretisation, materials))
+    options = replace(options, substep=stable_substep(options, materials))
     first = FIRST_SCENE[group] + SCENES_PER_SEED * options.seed
     configs = sample_configs(assets, options.scenes, options.objects, first)
     write_scene_configs(file, configs)
     made_by, count = provenance("heldout", [file, *(path for files in objects for path in files)], options), 0
-    settings = SimulationSettings(options.discretisation, options.frames, options.keypoints, device)
+    settings = SimulationSettings(options, options.frames, options.keypoints, device)
     bar = tqdm(total=len(configs), desc=name, unit="scene")
     with bar, KeypointMotionsWriter(motions, made_by) as writer:
         for batch in simulate(configs, assets, settings):
@@ -75,14 +75,14 @@ def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) ->
 
 def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Path) -> dict[int, Asset]:
     """The objects that the options choose."""
-    how, seed = (options.discretisation, options.keypoints), options.seed
+    how, seed = (options, options.keypoints), options.seed
     if meshes and options.shapes:
         return extra_objects.random_mesh_assets(meshes, options.shapes, *how, seed, cache)
     if meshes:
         return extra_objects.mesh_assets(meshes, options.size, *how)
     if options.rotations:
         ten = object_particles.load_assets(*how, cache)
-        return extra_objects.rotated_assets(ten, options.rotations, options.discretisation, seed)
+        return extra_objects.rotated_assets(ten, options.rotations, options, seed)
     shapes = HELDOUT_SHAPES
     if options.shapes:
         shapes = random_shapes(options.shapes, SHAPE_SEEDS[options.group(False)] + len(SHAPE_SEEDS) * seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option
 from stages.lab.dataset.selection import (
     HELDOUT,
     MESHES,
@@ -30,9 +31,11 @@ MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
 class Discretisation:
     """Resolution of the simulation in space and time."""
 
-    dx: float = 0.02  # grid spacing [m]
-    spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # [s]; the longest, where stable_substep applies
+    dx: float = option(0.02, "grid spacing [m]; published: 0.02")
+    spacing: float = option(0.009, "spacing of particles on a surface [m]")
+    substep: float = option(
+        SUBSTEP, "longest simulation time step [s], shortened for stiff light objects; published: 1e-4"
+    )
 
     @property
     def substeps(self) -> int:
@@ -41,24 +44,27 @@ class Discretisation:
 
 
 @dataclass(frozen=True)
-class DatasetOptions:
+class DatasetOptions(Discretisation):
     """Groups to generate, and the settings that determine their content."""
 
-    groups: str = "3_0..3_9,4,6"
-    parts: str = "motions"  # separated by commas
-    frames: int = 100
-    keypoints: int = 2048  # per object
-    dx: float = 0.02  # grid spacing [m]
-    spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # [s]
-    nudge: float = 0.0  # displacement of every start position, to measure sensitivity to initial conditions [m]
-    exact: bool = False  # identical bytes in every run, also on a GPU
-    views: str = "all"  # of the videos
-    backgrounds: str = "all"
-    resolution: int = 448  # of the videos [px]
-    shard: str = "1/1"
-    limit: int = 0  # scenes per group; 0: all
-    device: str = "auto"
+    groups: str = option("3_0..3_9,4,6", "groups of scenes; more_0..more_9 are further scenes of three objects")
+    parts: str = option(
+        "motions",
+        "what to generate, separated by commas: motions, scenes, mpm, initial, dynamic, objects, "
+        "backgrounds, scene_configs",
+    )
+    frames: int = option(100, "frames per scene, of 0.02 s each")
+    keypoints: int = option(2048, "keypoints per object in motions")
+    nudge: float = option(0.0, "shift of each object's initial position [m]; see `statistics --against`")
+    exact: bool = option(
+        False, "bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic"
+    )
+    views: str = option("all", "views of the videos: some of 0,4,...,96, or all")
+    backgrounds: str = option("all", "backgrounds of the videos: some of table0,...,table7, or all")
+    resolution: int = option(448, "side of the videos [px]")
+    shard: str = option("1/1", "i/n: the i-th of n equal parts of the groups")
+    limit: int = option(0, "scenes of each group; 0: all")
+    device: str = device_option()
 
     def __post_init__(self):
         parse_parts(self.parts), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
@@ -69,11 +75,6 @@ class DatasetOptions:
             raise InputError(f"--nudge {self.nudge}: from 0 to {MAX_NUDGE} m; scenes leave 0.05 between objects")
         if not 16 <= self.resolution <= 4096 or self.resolution % 2:
             raise InputError(f"--resolution {self.resolution}: an even number from 16 to 4096 pixels")
-
-    @property
-    def discretisation(self) -> Discretisation:
-        """Grid spacing, particle spacing and substep of the simulation."""
-        return Discretisation(self.dx, self.spacing, self.substep)
 
     @property
     def needed_parts(self) -> tuple[str, ...]:
@@ -114,22 +115,23 @@ class DatasetOptions:
 
 
 @dataclass(frozen=True)
-class HeldoutOptions:
+class HeldoutOptions(Discretisation):
     """Which objects and scenes to make, and the settings of their simulation."""
 
-    scenes: int = 100
-    objects: int = 3  # per scene
-    frames: int = 100
-    keypoints: int = 2048  # per object
-    dx: float = 0.02  # grid spacing [m]
-    spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # the longest; shorter for objects that are too stiff for it [s]
-    size: float = 0.5  # longest side of a mesh [m]
-    shapes: int = 0  # random shapes, or meshes of random size, and materials, instead of the eight
-    solid: bool = False  # fill the random shapes
-    rotations: int = 0  # random rotations of the ten objects, instead of the eight
-    seed: int = 0  # of scenes and random objects
-    device: str = "auto"
+    scenes: int = option(100, "number of scenes")
+    objects: int = option(3, "objects per scene")
+    frames: int = option(100, "frames per scene, of 0.02 s each")
+    keypoints: int = option(2048, "keypoints per object")
+    size: float = option(0.5, "longest side of a mesh [m]")
+    shapes: int = option(
+        0,
+        "number of random objects for training, written as the group varied (with --from made of its "
+        "meshes: the group meshes); 0: none",
+    )
+    solid: bool = option(False, "fill the random objects: the group solid")
+    rotations: int = option(0, "random rotations of the ten objects for training, written as the group turned; 0: none")
+    seed: int = option(0, "of scenes and random objects; other than 0: ends the group's name", min=0)
+    device: str = device_option()
 
     def __post_init__(self):
         if self.scenes < 1 or not 1 <= self.objects <= 6:
@@ -147,11 +149,6 @@ class HeldoutOptions:
         """Kind of the group of scenes, of meshes or not."""
         random = MESHES if meshes else SOLID if self.solid else VARIED
         return random if self.shapes else ROTATED if self.rotations else HELDOUT
-
-    @property
-    def discretisation(self) -> Discretisation:
-        """Grid spacing, particle spacing and longest substep of the simulation."""
-        return Discretisation(self.dx, self.spacing, self.substep)
 
 
 def _parse_shard(text: str) -> tuple[int, int]:

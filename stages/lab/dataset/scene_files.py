@@ -127,11 +127,10 @@ def write_scene_files(
             files.write_rest(configs[name], missing, assets)
             bar.update(not missing.needs_simulation)
         moving = {name: configs[name] for name, missing in todo.items() if missing.needs_simulation}
-        discretisation = options.discretisation
-        settings = SimulationSettings(discretisation, options.frames, options.keypoints, files.device, exact=True)
+        settings = SimulationSettings(options, options.frames, options.keypoints, files.device, exact=True)
         batches = simulation_batches(moving, assets.particles, settings, MAX_BATCH_PARTICLES) if moving else ()
         for scenes, batch in batches:
-            frames = list(batch.frames(options.frames, FRAME_INTERVAL, discretisation.substeps, GRAVITY))
+            frames = list(batch.frames(options.frames, FRAME_INTERVAL, options.substeps, GRAVITY))
             for k in valid_scenes(scenes, batch):
                 name = scenes[k].name
                 files.write_motion(scenes[k], todo[name], assets, [frame.of(name) for frame in frames])

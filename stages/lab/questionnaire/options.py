@@ -3,15 +3,16 @@
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
+from stages.core.options import option, seed_option
 
 
 @dataclass(frozen=True)
 class StudyOptions:
     """Size of a study; the defaults are those of the paper."""
 
-    participants: int = 61
-    films: int = 80  # shown to each participant
-    seed: int = 0
+    participants: int = option(61, "number of pages")
+    films: int = option(80, "films per page")
+    seed: int = seed_option()
 
     def __post_init__(self):
         if self.participants < 1 or self.films < 1:

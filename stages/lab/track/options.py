@@ -4,19 +4,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 
 
 @dataclass(frozen=True)
 class TrackOptions:
     """How films are read and what is written."""
 
-    resolution: int = 320  # longest side at which pictures are compared [px]
-    frames: int = 0  # to track; 0: up to where the scene file says that everything rests
-    masks: Path | None = None  # folder with a folder of label images for each film
-    soft: str = ""  # names of objects that deform, separated by commas
-    keypoints: int = 256  # per object, in the trajectory
-    seed: int = 0  # of the keypoints
-    device: str = "auto"
+    resolution: int = option(320, "longest side at which frames and renderings are compared [px]")
+    frames: int = option(0, "frames from the release on; 0: until everything rests")
+    masks: Path | None = option(None, "folder with a folder of label images for each film, one for each frame")
+    soft: str = option("", "names of objects that deform, separated by commas; others are rigid")
+    keypoints: int = option(256, "keypoints per object, in the trajectory")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if not 64 <= self.resolution <= 4096:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
+from stages.core.options import device_option, option, seed_option
 
 LOSSES = ("square", "scene", "axes", "relative")
 OPTIMIZERS = ("adamw", "soap")
@@ -14,22 +15,28 @@ HORIZON_FRACTIONS = (0.35, 0.35, 0.3)  # of the budget, for three horizons
 class TrainOptions:
     """Budget, batches, loss and optimizer of a training run."""
 
-    minutes: float = 20.0  # budget, validation included
-    steps: int = 0  # budget in optimizer steps instead, when not 0: the same on every machine
-    batch: int = 32  # scenes a step
-    keypoints: int = 256  # of an object
-    sparse_keypoints: int = 0  # keypoints of an object in every fourth step, for robustness to their number; 0: never
-    lr: float = 1e-3  # peak learning rate
-    horizons: str = "8,20,40"  # frames of a rollout, one phase each
-    width: int = 0  # width of the network; 0: the model's own
-    loss: str = "scene"  # one of rollout_loss.LOSSES
-    optimizer: str = "adamw"  # one of state.OPTIMIZERS
-    velocity_weight: float = 0.0  # time over which a velocity error counts as a position error [s]; 0: none
-    gradient_discount: float = 0.9  # factor on a gradient per frame of backpropagation
-    groups: str = "3_0..3_8"  # training files; the last scenes of the last are for validation
-    compiled: bool = False  # compile a step first: takes minutes, then faster; for GPUs
-    seed: int = 0
-    device: str = "auto"
+    minutes: float = option(20.0, "training time [min]")
+    steps: int = option(0, "optimizer steps instead of --minutes; 0: use --minutes")
+    batch: int = option(32, "scenes per step")
+    keypoints: int = option(256, "keypoints per object")
+    sparse_keypoints: int = option(0, "keypoints per object in every fourth step; 0: the same in all steps")
+    lr: float = option(1e-3, "maximum learning rate")
+    horizons: str = option("8,20,40", "rollout length of each phase [frames]")
+    width: int = option(0, "width of the network, may exceed that of --from; 0: the model's default")
+    loss: str = option(
+        "scene",
+        "square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | relative: "
+        "axes, divided by the amount of motion",
+    )
+    optimizer: str = option("adamw", "adamw | soap (extra `train`)")
+    velocity_weight: float = option(0.0, "weight of velocity errors relative to position errors [s]; 0: none")
+    gradient_discount: float = option(0.9, "factor on the gradient per frame of backpropagation")
+    groups: str = option(
+        "3_0..3_8", "groups to train on, also varied, solid, turned, meshes; the last 100 scenes are for validation"
+    )
+    compiled: bool = option(False, "compile the training step first; for GPUs")
+    seed: int = seed_option()
+    device: str = device_option()
     checks: int = 24  # validations and checkpoints in the whole run
 
     def __post_init__(self):
@@ -72,14 +79,14 @@ class TrainOptions:
 class SplatterOptions:
     """Length, views, depth and optimizer of a training run."""
 
-    steps: int = 20_000  # of the optimizer
-    views: int = 4  # from which Gaussians are predicted in a step; one more is rendered
-    side: int = 448  # longest side of an image [px]
-    depth: str = "network"  # of the Gaussians: predicted by the network, or the true depth of rendered scenes ("given")
-    width: int = 0  # 0: start from weights; else a small random network of this width, for trials
-    lr: float = 1e-4  # peak learning rate
-    seed: int = 0
-    device: str = "auto"
+    steps: int = option(20_000, "optimizer steps")
+    views: int = option(4, "input views per step; one more view is rendered")
+    side: int = option(448, "longest side of an image [px]")
+    depth: str = option("network", "depth of the Gaussians: network | given (true depth, for scenes only)")
+    width: int = option(0, "width of a small random network that replaces the weights, for tests; 0: none")
+    lr: float = option(1e-4, "maximum learning rate")
+    seed: int = seed_option()
+    device: str = device_option()
 
     def __post_init__(self):
         if min(self.steps, self.views) < 1 or self.side < 14 or self.lr <= 0:
@@ -94,17 +101,17 @@ class SplatterOptions:
 class SegmenterTraining:
     """Settings of the training."""
 
-    minutes: float = 30.0  # of the network; 0: its weights stay as they are
-    steps: int = 0  # 0: as many as fit in `minutes`
-    rate: float = 2e-3
-    voxels: int = 14_000  # of a training crop
-    batch: int = 1  # crops per step, of each process
-    workers: int = 0  # processes that prepare crops; 0: the training process
-    seed: int = 0
-    device: str = "auto"
+    minutes: float = option(30.0, "training time of the network [min]; 0: train only the candidate scores")
+    steps: int = option(0, "optimizer steps instead of --minutes; 0: use --minutes")
+    rate: float = option(2e-3, "maximum learning rate")
+    voxels: int = option(14_000, "largest number of voxels of a training crop")
+    batch: int = option(1, "crops per step")
+    workers: int = option(0, "processes that prepare crops; 0: the training process itself")
+    seed: int = seed_option()
+    device: str = device_option()
     widths: tuple[int, ...] = (32, 48, 64, 96)
-    blocks: int = 2  # residual blocks of each level, down and up
-    score_scenes: int = 200  # augmented examples whose candidates train the scores
+    blocks: int = option(2, "residual blocks of each level, down and up")
+    score_scenes: int = option(200, "augmented scenes whose candidates train the scores")
     score_steps: int = 3000
 
     def __post_init__(self):

@@ -39,7 +39,7 @@ def test_scenes_have_the_requested_particles_eight_per_cell(particles):
 
 def test_report_has_ratios_and_the_machine(monkeypatch, device):
     monkeypatch.setattr(bench_mpm.bench, "copy_bandwidth", lambda device: 1e10)
-    lines = list(bench_mpm.run(MpmBenchOptions(device, (400,), scenes=2, frames=1)))
+    lines = list(bench_mpm.run(None, MpmBenchOptions(device, (400,), scenes=2, frames=1)))
     assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 6
     assert all(sum(f"mpm {schedule}" in line for line in lines) == 1 for schedule in ("exact", "contact"))
     for line in lines[2:]:

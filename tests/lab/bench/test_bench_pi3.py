@@ -25,7 +25,7 @@ def test_naive_attention_equals_fused_attention():
 
 @pytest.mark.parametrize("splats", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_report_has_a_line_per_view_count_and_baseline(splats, device):
-    lines = list(run(Pi3BenchOptions(device, (1, 2), 28, 1, splats), TINY_SPLAT))
+    lines = list(run(None, Pi3BenchOptions(device, (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")
     assert all("unfused attention" in line for line in lines[3::2])
 
@@ -37,10 +37,10 @@ def test_out_of_memory_is_reported(monkeypatch, device):
         raise torch.OutOfMemoryError
 
     monkeypatch.setattr(bench_pi3, "naive_attention", table)
-    lines = list(run(Pi3BenchOptions(device, (1,), 28, 1), TINY))[2:]
+    lines = list(run(None, Pi3BenchOptions(device, (1,), 28, 1), TINY))[2:]
     assert " s " in lines[0] and lines[1].endswith("unfused attention: out of memory")
     monkeypatch.setattr(bench_pi3, "measure", table)
-    (line,) = list(run(Pi3BenchOptions(device, (3,), 28, 1), TINY))[2:]
+    (line,) = list(run(None, Pi3BenchOptions(device, (3,), 28, 1), TINY))[2:]
     assert line.startswith("views   3  out of memory (estimate") and "nan" not in line
 
 

@@ -105,6 +105,9 @@ class Kinematics(NamedTuple):
     points: Tensor  # (b o, POINT_SIZE, n)
     field: Tensor  # (b o, FIELD_SIZE, n)
     planes: Tensor  # (b o, 2, n) distance to the floor and to the nearest wall [m], the least of now and a frame later
+    o: int  # objects of a scene
+    n: int  # keypoints of an object
+    BLOCK: tl.constexpr  # n, padded to a power of two
 
 
 @triton.jit

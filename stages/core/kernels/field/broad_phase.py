@@ -39,6 +39,8 @@ class ContactLists(NamedTuple):
     wide: int  # slots of each list of contacts with another object
     narrow: int  # slots of the list of contacts with walls
     slots: int  # of all lists
+    o: int  # objects of a scene
+    n: int  # keypoints of an object
     FLOOR_BLOCKS: tl.constexpr  # blocks of rows of the floor's list, padded to a power of two
     PLANE_BLOCKS: tl.constexpr  # of the lists of floor and walls
 
@@ -57,14 +59,14 @@ def _contact_distance(body, i, j, SEARCH_RADIUS: tl.constexpr):
 
 
 @triton.jit
-def gather_candidates(inputs, drifted, candidates, C: tl.constexpr):
+def gather_candidates(valid, drifted, candidates, C: tl.constexpr):
     """List the points of object i within contact distance of another object's bounding box: `position`, `which` and
     `count` of the candidates."""
-    i, k, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n
+    i, k, o, n = tl.program_id(0), tl.program_id(1), drifted.o, drifted.n
     j = other_object(i, k, o)
     radius = _contact_distance(drifted.body, i, j, C.SEARCH_RADIUS)
-    r = tl.arange(0, inputs.BLOCK)
-    near = tl.load(inputs.valid + i * n + r, mask=r < n, other=0) != 0
+    r = tl.arange(0, drifted.BLOCK)
+    near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
     x = load3(drifted.points + (POINT_SIZE * i + POINT) * n + r, n, r < n)
     for axis in tl.static_range(3):
         near &= x[axis] > tl.load(drifted.body + BODY_SIZE * j + BOX_LOW + axis) - radius
@@ -77,9 +79,9 @@ def gather_candidates(inputs, drifted, candidates, C: tl.constexpr):
 
 
 @triton.jit
-def nearest_candidates(inputs, drifted, candidates, C: tl.constexpr):
+def nearest_candidates(drifted, candidates, C: tl.constexpr):
     """For each listed point find the other object's nearest listed point: `partner` and `key` of the candidates."""
-    o, n = inputs.o, inputs.n
+    o, n = drifted.o, drifted.n
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
     j = other_object(i, k, o)
     row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
@@ -130,16 +132,16 @@ def _smallest(key, near, count):
 
 
 @triton.jit
-def select_contacts(inputs, drifted, candidates, lists, C: tl.constexpr):
+def select_contacts(valid, drifted, candidates, lists, C: tl.constexpr):
     """Select the contact points of an object with one other object, the floor or the walls: the closest ones, at most
     a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes `count`, `point` and `partner` of the
     lists, and zeros as accelerations."""
-    i, k, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n
+    i, k, o, n = tl.program_id(0), tl.program_id(1), drifted.o, drifted.n
     m = o - 1
-    r = tl.arange(0, inputs.BLOCK)
-    limit_count = tl.sum(tl.load(inputs.valid + i * n + r, mask=r < n, other=0).to(tl.int32))
+    r = tl.arange(0, drifted.BLOCK)
+    limit_count = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
     infinity: tl.constexpr = float("inf")
-    zero = tl.zeros([inputs.BLOCK], tl.float32)
+    zero = tl.zeros([drifted.BLOCK], tl.float32)
     store3(lists.acceleration + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
     to = i * lists.slots + k * lists.wide
     if k < m:

@@ -28,33 +28,66 @@ from stages.core.kernels.field.layers import (
 from stages.core.kernels.field.vec3 import add, cross, dot, load3, scale3, store3, sub, sum3, write3
 
 
-class ContactLayers(NamedTuple):
-    """Layers (weight, bias) of a ContactNet, by their names there, and its numbers of features."""
+class EmbeddingLayers(NamedTuple):
+    """Layers (weight, bias) that map object embeddings into the first layers of the other networks."""
 
-    own_projection: tuple
-    partner_projection: tuple | None
+    own: tuple  # of contacts between objects, as the next
+    partner: tuple | None
+    plane: tuple  # of contacts with floor and walls
+    deformation: tuple
+    H: tl.constexpr  # hidden columns
+
+
+class ContactEncoder(NamedTuple):
+    """Layers (weight, bias) from the features of a contact point to its message, and the numbers of features."""
+
     input_layer: tuple
     message: tuple
-    context_projection: tuple
-    decoder: tuple
     VECTORS: tl.constexpr
     SCALARS: tl.constexpr
 
 
-class FieldLayers(NamedTuple):
-    """Layers (weight, bias) of a ForceField, by their names there, and what all of its layers have in common."""
+class ContactDecoder(NamedTuple):
+    """Layers (weight, bias) from the message of a contact point to the weights of its vectors, and their number."""
 
-    pairs: ContactLayers
-    planes: ContactLayers
-    object_update: tuple
-    pair_update: tuple
-    plane_update: tuple
-    friction: tuple
-    embedding_projection: tuple  # of the deformation network, as the two that follow
-    deformation_input: tuple
-    deformation_decoder: tuple
-    H: tl.constexpr  # hidden columns
+    layers: tuple
+    VECTORS: tl.constexpr
+
+
+class EncoderLayers(NamedTuple):
+    """The encoders of contacts between objects, and with floor and walls."""
+
+    pairs: ContactEncoder
+    planes: ContactEncoder
+    H: tl.constexpr
     PRECISION: tl.constexpr  # of products
+
+
+class StatusLayers(NamedTuple):
+    """Layers (weight, bias) of an object's status vector, and from it to the friction of the floor."""
+
+    update: tuple
+    friction: tuple
+    H: tl.constexpr
+
+
+class ContextLayers(NamedTuple):
+    """Layers (weight, bias) that update a contact between objects, or with floor and walls, and its projection."""
+
+    pair_update: tuple
+    pair_projection: tuple
+    plane_update: tuple
+    plane_projection: tuple
+    H: tl.constexpr
+
+
+class DecoderLayers(NamedTuple):
+    """The decoders of contacts between objects, and with floor and walls."""
+
+    pairs: ContactDecoder
+    planes: ContactDecoder
+    H: tl.constexpr
+    PRECISION: tl.constexpr
 
 
 class Messages(NamedTuple):
@@ -80,21 +113,21 @@ def _project(layer, x, H: tl.constexpr):
 
 
 @triton.jit
-def project_embeddings(inputs, layers, messages):
+def project_embeddings(embedding, o, layers, offset):
     """Contribution of the object embeddings to the first layer of each contact; in the row after all contacts, to the
     first layer of the deformation network: `offset`."""
     H: tl.constexpr = layers.H
-    i, k, o = tl.program_id(0), tl.program_id(1), inputs.o
+    i, k = tl.program_id(0), tl.program_id(1)
     m, h = o - 1, tl.arange(0, H)
-    own = tl.load(inputs.embedding + i * H + h)
+    own = tl.load(embedding + i * H + h)
     if k < m:
-        partner = tl.load(inputs.embedding + other_object(i, k, o) * H + h)
-        y = _project(layers.pairs.own_projection, own, H) + _project(layers.pairs.partner_projection, partner, H)
+        partner = tl.load(embedding + other_object(i, k, o) * H + h)
+        y = _project(layers.own, own, H) + _project(layers.partner, partner, H)
     elif k < m + 2:
-        y = _project(layers.planes.own_projection, own, H)
+        y = _project(layers.plane, own, H)
     else:
-        y = _project(layers.embedding_projection, own, H)
-    tl.store(messages.offset + (i * (o + 2) + k) * H + h, y)
+        y = _project(layers.deformation, own, H)
+    tl.store(offset + (i * (o + 2) + k) * H + h, y)
 
 
 @triton.jit
@@ -114,10 +147,10 @@ def _encode(record, there, net, offset, H: tl.constexpr, PRECISION: tl.constexpr
 
 
 @triton.jit
-def encode_messages(inputs, lists, layers, messages):
+def encode_messages(lists, layers, messages):
     """Message and weight of each contact point; weighted sums over each block."""
     H: tl.constexpr = layers.H
-    i, o, slots = tl.program_id(0), inputs.o, lists.slots
+    i, o, slots = tl.program_id(0), lists.o, lists.slots
     m, slot = o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(lists, slot, m)
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
@@ -139,10 +172,10 @@ def encode_messages(inputs, lists, layers, messages):
 
 
 @triton.jit
-def aggregate_messages(inputs, lists, layers, messages, C: tl.constexpr):
+def aggregate_messages(embedding, lists, layers, messages, C: tl.constexpr):
     """Mean message of each contact of an object, its status vector from all of them, and the floor's friction."""
     H: tl.constexpr = layers.H
-    i, o, slots = tl.program_id(0), inputs.o, lists.slots
+    i, o, slots = tl.program_id(0), lists.o, lists.slots
     m, h, block = o - 1, tl.arange(0, H), tl.arange(0, lists.FLOOR_BLOCKS)
     others, planes, supported = tl.zeros([H], tl.float32), tl.zeros([H], tl.float32), 0.0
     for k in range(o + 1):
@@ -159,21 +192,21 @@ def aggregate_messages(inputs, lists, layers, messages, C: tl.constexpr):
         others += tl.where(k < m, x, 0.0)
         planes += tl.where(k < m, 0.0, x)
         supported += tl.where(k == m, total_weight * normaliser, 0.0)
-    w, b = layers.object_update[0]
-    y = matvec(w, tl.load(inputs.embedding + i * H + h), 0, 3 * H, H) + matvec(w, others, H, 3 * H, H)
+    w, b = layers.update[0]
+    y = matvec(w, tl.load(embedding + i * H + h), 0, 3 * H, H) + matvec(w, others, H, 3 * H, H)
     y = silu(y + matvec(w, planes, 2 * H, 3 * H, H) + tl.load(b + h))
-    y = _project(layers.object_update[1], y, H)
+    y = _project(layers.update[1], y, H)
     tl.store(messages.status + i * H + h, y)
     ratio = tl.sigmoid(tl.sum(y * tl.load(layers.friction[0] + h)) + tl.load(layers.friction[1]))
     tl.store(messages.friction + i, C.MAX_FRICTION_SPEED * ratio * supported)
 
 
 @triton.jit
-def update_contacts(inputs, layers, messages):
+def update_contacts(o, layers, messages):
     """Second-layer input of a contact's points, from both objects' mean messages of it and their status vectors:
     `context`."""
     H: tl.constexpr = layers.H
-    i, k, o = tl.program_id(0), tl.program_id(1), inputs.o
+    i, k = tl.program_id(0), tl.program_id(1)
     m, h = o - 1, tl.arange(0, H)
     x, own = tl.load(messages.mean + (i * (o + 1) + k) * H + h), tl.load(messages.status + i * H + h)
     if k < m:
@@ -184,29 +217,29 @@ def update_contacts(inputs, layers, messages):
         y += matvec(w, own, 2 * H, 4 * H, H)
         y += matvec(w, tl.load(messages.status + j * H + h), 3 * H, 4 * H, H)
         y = _project(layers.pair_update[1], silu(y + tl.load(b + h)), H)
-        y = _project(layers.pairs.context_projection, y, H)
+        y = _project(layers.pair_projection, y, H)
     else:
         w, b = layers.plane_update[0]
         y = matvec(w, x, 0, 2 * H, H) + matvec(w, own, H, 2 * H, H)
         y = _project(layers.plane_update[1], silu(y + tl.load(b + h)), H)
-        y = _project(layers.planes.context_projection, y, H)
+        y = _project(layers.plane_projection, y, H)
     tl.store(messages.context + (i * (o + 1) + k) * H + h, y)
 
 
 @triton.jit
 def _decode(record, there, net, x, H: tl.constexpr, PRECISION: tl.constexpr):
     """Accelerations of a block of contact points (3 vectors of ROWS), from the inputs x of the second layer."""
-    x = silu(linear_layer(silu(x), net.decoder[0], H, H, H, PRECISION))
-    x = linear_layer(x, net.decoder[1], net.VECTORS, H, PADDED_VECTORS, PRECISION)
+    x = silu(linear_layer(silu(x), net.layers[0], H, H, H, PRECISION))
+    x = linear_layer(x, net.layers[1], net.VECTORS, H, PADDED_VECTORS, PRECISION)
     return weighted_vectors(record, there, x, net.VECTORS)
 
 
 @triton.jit
-def decode_forces(inputs, lists, layers, messages, C: tl.constexpr):
+def decode_forces(lists, layers, messages, C: tl.constexpr):
     """Decode the acceleration of each contact point, and force and torque of each block (`wrenches`): per unit of
     mass, for pairs of objects of reduced mass."""
     H: tl.constexpr = layers.H
-    i, o, n, slots = tl.program_id(0), inputs.o, inputs.n, lists.slots
+    i, o, n, slots = tl.program_id(0), lists.o, lists.n, lists.slots
     m, slot = o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(lists, slot, m)
     row, to = i * (o + 1) + k, messages.wrenches + (i * (slots // ROWS) + tl.program_id(1)) * WRENCH_SIZE

@@ -3,6 +3,8 @@
 Reference: `stages.core.models.field.deformation`. Written in Triton (see `compilers`).
 """
 
+from typing import NamedTuple
+
 import triton
 import triton.language as tl
 
@@ -19,6 +21,15 @@ from stages.core.kernels.field.layers import (
 from stages.core.kernels.field.vec3 import add, load3, read3, read9, scale3, store3, sub, transposed_matvec3
 
 FEATURE_COLUMNS = tl.constexpr(36)  # columns of a point in a record: 12 vectors
+
+
+class DeformationLayers(NamedTuple):
+    """Layers (weight, bias) of the deformation network."""
+
+    input_layer: tuple
+    decoder: tuple
+    H: tl.constexpr  # hidden columns
+    PRECISION: tl.constexpr  # of products
 
 
 @triton.jit
@@ -76,10 +87,10 @@ def internal_accelerations(inputs, record, layers, offset, acceleration, C: tl.c
     i, block, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n
     p = block * ROWS + tl.arange(0, ROWS)
     record += (i * tl.num_programs(1) + block) * FEATURE_COLUMNS * ROWS
-    y = invariant_layer(record, layers.deformation_input, MAX_VECTORS, 0, H, layers.PRECISION)
+    y = invariant_layer(record, layers.input_layer, MAX_VECTORS, 0, H, layers.PRECISION)
     y = silu(y + tl.load(offset + (i * (o + 2) + o + 1) * H + tl.arange(0, H))[None, :])
-    y = silu(linear_layer(y, layers.deformation_decoder[0], H, H, H, layers.PRECISION))
-    y = linear_layer(y, layers.deformation_decoder[1], 9, H, PADDED_VECTORS, layers.PRECISION)
+    y = silu(linear_layer(y, layers.decoder[0], H, H, H, layers.PRECISION))
+    y = linear_layer(y, layers.decoder[1], 9, H, PADDED_VECTORS, layers.PRECISION)
     v = tl.arange(0, PADDED_VECTORS)[None, :]
     driving = tl.load(inputs.compliance_scale + i) * y
     damping = tl.where(v < 6, -C.MAX_DAMPER_WEIGHT * tl.sigmoid(y - 2), driving)

@@ -12,6 +12,7 @@ all z. Contact points of an object lie in one list: a segment for each other obj
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import triton
@@ -94,26 +95,59 @@ def _network(layers: nn.Sequential) -> tuple[tuple[Tensor, Tensor], ...]:
     return tuple(_linear(x) for x in layers if isinstance(x, nn.Linear))
 
 
-def _contact_layers(net: ContactNet, vectors: int, scalars: int) -> contact_messages.ContactLayers:
-    return contact_messages.ContactLayers(
-        own_projection=_linear(net.own_projection),
-        partner_projection=net.partner_projection and _linear(net.partner_projection),
-        input_layer=_linear(net.input_layer), message=_network(net.message),
-        context_projection=_linear(net.context_projection), decoder=_network(net.decoder),
-        VECTORS=tl.constexpr(vectors), SCALARS=tl.constexpr(scalars),
-    )  # fmt: skip
+class _Layers(NamedTuple):
+    """The layers of each kernel that evaluates networks."""
+
+    embeddings: contact_messages.EmbeddingLayers
+    encoder: contact_messages.EncoderLayers
+    status: contact_messages.StatusLayers
+    context: contact_messages.ContextLayers
+    decoder: contact_messages.DecoderLayers
+    deformation: deformation_features.DeformationLayers
 
 
-def _field_layers(field: nn.Module) -> contact_messages.FieldLayers:
+def _layers(field: nn.Module, scene: FieldScene) -> _Layers:
+    """The layers of a field, collected once for each scene, whose embeddings depend on them as well.
+
+    Weights may change in place, but not be replaced.
+    """
     precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
-    deformation = field.deformation
-    return contact_messages.FieldLayers(
-        pairs=_contact_layers(field.pairs, 10, 7), planes=_contact_layers(field.planes, 8, 5),
-        object_update=_network(field.object_update), pair_update=_network(field.pair_update),
-        plane_update=_network(field.plane_update), friction=_linear(field.friction),
-        embedding_projection=_linear(deformation.embedding_projection),
-        deformation_input=_linear(deformation.input_layer), deformation_decoder=_network(deformation.decoder),
-        H=tl.constexpr(field.config["hidden"]), PRECISION=tl.constexpr(precision),
+    held, key = scene.__dict__.setdefault("_layers", {}), (field, precision)  # apart from the fields, which are frozen
+    if key not in held:
+        held[key] = _collect(field, tl.constexpr(precision))
+    return held[key]
+
+
+def _collect(field: nn.Module, precision: tl.constexpr) -> _Layers:
+    hidden, pairs, planes, deformation = (
+        tl.constexpr(field.config["hidden"]),
+        field.pairs,
+        field.planes,
+        field.deformation,
+    )
+
+    def encoder(net: ContactNet, vectors: int, scalars: int) -> contact_messages.ContactEncoder:
+        return contact_messages.ContactEncoder(_linear(net.input_layer), _network(net.message), tl.constexpr(vectors),
+                                               tl.constexpr(scalars))  # fmt: skip
+
+    def decoder(net: ContactNet, vectors: int) -> contact_messages.ContactDecoder:
+        return contact_messages.ContactDecoder(_network(net.decoder), tl.constexpr(vectors))
+
+    return _Layers(
+        embeddings=contact_messages.EmbeddingLayers(
+            _linear(pairs.own_projection), pairs.partner_projection and _linear(pairs.partner_projection),
+            _linear(planes.own_projection), _linear(deformation.embedding_projection), hidden,
+        ),
+        encoder=contact_messages.EncoderLayers(encoder(pairs, 10, 7), encoder(planes, 8, 5), hidden, precision),
+        status=contact_messages.StatusLayers(_network(field.object_update), _linear(field.friction), hidden),
+        context=contact_messages.ContextLayers(
+            _network(field.pair_update), _linear(pairs.context_projection), _network(field.plane_update),
+            _linear(planes.context_projection), hidden,
+        ),
+        decoder=contact_messages.DecoderLayers(decoder(pairs, 10), decoder(planes, 8), hidden, precision),
+        deformation=deformation_features.DeformationLayers(
+            _linear(deformation.input_layer), _network(deformation.decoder), hidden, precision
+        ),
     )  # fmt: skip
 
 
@@ -135,7 +169,7 @@ class _Step:
         arrays = {name: x.contiguous() for name, x in arrays.items()}
         block = tl.constexpr(max(64, triton.next_power_of_2(self.n)))
         self.inputs = bodies.StepInputs(**arrays, o=self.o, n=self.n, dt=dt, BLOCK=block)
-        self.layers = _field_layers(field)
+        self.layers = _layers(field, scene)
         self.segments = segment_sizes(self.o, self.n)
         self.blocks = sum(self.segments) // ROWS
 
@@ -157,7 +191,8 @@ class _Step:
 
     def _drift(self, state: BodyState) -> bodies.Kinematics:
         widths = bodies.POINT_SIZE.value, bodies.FIELD_SIZE.value, 2
-        drifted = bodies.Kinematics(self._new(bodies.BODY_SIZE.value), *(self._new(k, self.n) for k in widths))
+        drifted = bodies.Kinematics(self._new(bodies.BODY_SIZE.value), *(self._new(k, self.n) for k in widths),
+                                    self.o, self.n, self.inputs.BLOCK)  # fmt: skip
         state = BodyState(*(x.contiguous() for x in state))
         bodies.drift_half_step[(self.objects,)](state, self.inputs, drifted, CONSTANTS, num_warps=8)
         return drifted
@@ -169,20 +204,21 @@ class _Step:
             partner=self._count(m, n),
         )  # fmt: skip
         if m:
-            shared = self.inputs, drifted, candidates, CONSTANTS
-            broad_phase.gather_candidates[(self.objects, m)](*shared, num_warps=8)
+            broad_phase.gather_candidates[(self.objects, m)](
+                self.inputs.valid, drifted, candidates, CONSTANTS, num_warps=8
+            )
             blocks = triton.cdiv(n, broad_phase.QUERY_BLOCK.value)
-            broad_phase.nearest_candidates[(self.objects * m, blocks)](*shared)
+            broad_phase.nearest_candidates[(self.objects * m, blocks)](drifted, candidates, CONSTANTS)
         *others, floor, narrow = self.segments
         slots, wide = sum(self.segments), others[0] if others else floor
         padded = [tl.constexpr(triton.next_power_of_2(k // ROWS)) for k in (floor, floor + narrow)]
         lists = broad_phase.ContactLists(
             count=self._count(kinds), point=self._count(slots), partner=self._count(slots),
             record=self._new(slots * contact_features.COLUMNS.value), acceleration=self._new(kinds, 3, n),
-            wide=wide, narrow=narrow, slots=slots, FLOOR_BLOCKS=padded[0], PLANE_BLOCKS=padded[1],
+            wide=wide, narrow=narrow, slots=slots, o=self.o, n=n, FLOOR_BLOCKS=padded[0], PLANE_BLOCKS=padded[1],
         )  # fmt: skip
         broad_phase.select_contacts[(self.objects, kinds)](
-            self.inputs, drifted, candidates, lists, CONSTANTS, num_warps=8
+            self.inputs.valid, drifted, candidates, lists, CONSTANTS, num_warps=8
         )
         contact_features.contact_features[(self.objects, self.blocks)](
             self.inputs, drifted, lists, CONSTANTS, num_warps=2
@@ -190,7 +226,7 @@ class _Step:
         return lists
 
     def _messages(self, lists: broad_phase.ContactLists) -> contact_messages.Messages:
-        kinds, slots, h = self.o + 1, lists.slots, self.layers.H.value
+        kinds, slots, h = self.o + 1, lists.slots, self.layers.status.H.value
         messages = contact_messages.Messages(
             offset=self._new(kinds + 1, h), message=self._new(slots, h), weight=self._new(slots),
             block_sum=self._new(self.blocks, h), block_weight=self._new(self.blocks), mean=self._new(kinds, h),
@@ -199,12 +235,14 @@ class _Step:
         )  # fmt: skip
         of_objects, of_lists, of_blocks = (self.objects,), (self.objects, kinds), (self.objects, self.blocks)
         embeddings = self.objects, kinds + 1
-        contact_messages.project_embeddings[embeddings](self.inputs, self.layers, messages)
-        shared = self.inputs, lists, self.layers, messages
-        contact_messages.encode_messages[of_blocks](*shared)
-        contact_messages.aggregate_messages[of_objects](*shared, CONSTANTS, num_warps=8)
-        contact_messages.update_contacts[of_lists](self.inputs, self.layers, messages)
-        contact_messages.decode_forces[of_blocks](*shared, CONSTANTS)
+        embedding, layers = self.inputs.embedding, self.layers
+        contact_messages.project_embeddings[embeddings](embedding, self.o, layers.embeddings, messages.offset)
+        contact_messages.encode_messages[of_blocks](lists, layers.encoder, messages)
+        contact_messages.aggregate_messages[of_objects](
+            embedding, lists, layers.status, messages, CONSTANTS, num_warps=8
+        )
+        contact_messages.update_contacts[of_lists](self.o, layers.context, messages)
+        contact_messages.decode_forces[of_blocks](lists, layers.decoder, messages, CONSTANTS)
         return messages
 
     def _update(
@@ -226,7 +264,7 @@ class _Step:
         acceleration = self._new(3, n)
         deformation_features.deformation_features[of_blocks](inputs, drifted, averages, split.unit, record, num_warps=2)
         deformation_features.internal_accelerations[of_blocks](
-            inputs, record, self.layers, messages.offset, acceleration, CONSTANTS
+            inputs, record, self.layers.deformation, messages.offset, acceleration, CONSTANTS
         )
         velocity_update.update_displacements[(self.objects,)](
             inputs, drifted, acceleration, new, CONSTANTS, num_warps=8

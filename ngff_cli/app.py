@@ -162,7 +162,7 @@ def evaluate(
 
 
 def main() -> None:
-    """Entry point of the script `ngff`."""
+    """Run the command that this process was started with."""
     run_command_line(app)
 
 

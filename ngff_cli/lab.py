@@ -178,7 +178,7 @@ app.add_typer(bench.app, name="bench")
 
 
 def main() -> None:
-    """Entry point of the script `ngff-lab`."""
+    """Run the command that this process was started with."""
     run_command_line(app)
 
 

@@ -86,3 +86,19 @@ def test_commands_do_not_import_what_they_do_not_use(inputs, device, chosen):
     found = [json.loads(line) for line in (inputs / "found.txt").read_text().splitlines()]
     (inputs / "found.txt").unlink()
     assert dict(zip(commands, found, strict=True)) == {command: [0, []] for command in commands}, done.stderr
+
+
+@pytest.mark.parametrize("script", ["ngff", "ngff_lab"])
+def test_an_interrupt_while_the_command_line_is_imported_ends_in_one_line(script):
+    code = f"""
+import sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupting())
+from ngff_cli import {script}
+{script}()
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "ngff: interrupted\n")

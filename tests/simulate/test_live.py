@@ -392,7 +392,7 @@ def test_an_engine_that_fails_at_the_start_ends_the_command(tmp_path, monkeypatc
 
 def start_session(folder: Path, *options: str):
     """The command in a process of its own, on the CPU, where a motion repeats to the bit; and its address."""
-    code = "from ngff_cli.app import main; main()"
+    code = "from ngff_cli import ngff; ngff()"
     words = ["simulate", "scene.ply", "-o", "traj.h5", "--live", "--no-browser", "--device", "cpu", *options]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     process = subprocess.Popen([sys.executable, "-c", code, *words], cwd=folder, stdout=subprocess.PIPE, text=True,

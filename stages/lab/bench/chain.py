@@ -143,7 +143,7 @@ def _busy_samples(device: str) -> Iterator[list[int]]:
 def _command_seconds(line: list[str]) -> float:
     """Seconds of one command in a process of its own. Raises InputError with its message if it fails."""
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", "from ngff_cli.app import main; main()", *line],
+    done = subprocess.run([sys.executable, "-c", "from ngff_cli import ngff; ngff()", *line],
                           capture_output=True, text=True)  # fmt: skip
     if done.returncode:
         raise InputError(f"ngff {line[0]} failed: {done.stderr.strip()[-300:]}")

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from stages.core.physics.covered_hull import hull_voxels
 from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 
 MIN_PARTICLES = 40  # per object
@@ -20,18 +21,20 @@ LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are c
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 STRAY = 0.01  # fraction of an object's points that may be below it, and of voxels in which others may be
 UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
+SOLID = 0.9  # fraction of its hull that a body without leaks fills at least: voxels are accurate to about 5 %
 FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
 
 
 def closed_body(
-    points: np.ndarray, h: float, gap: float, floor: float | None, others: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
+    points: np.ndarray, h: float, gap: float, floor: float | None, others: np.ndarray | None = None,
+    hull: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
     It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
     no undersides of what is at rest, and only parts of the surface around them. So those with points of `others` (k, 3)
     are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are
-    not inside.
+    not inside. A body whose surface is its convex `hull` (planes, see `covered_hull`) and which leaks is that hull.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
@@ -65,6 +68,10 @@ def closed_body(
         inside = np.count_nonzero(added[tuple(theirs.T)]) > STRAY * added.sum()
         if other.sum() > FULLER * body.sum() and not inside:
             body = other
+    if hull is not None:
+        inside = hull_voxels(hull, low, h, shape)
+        if body.sum() < SOLID * inside.sum():
+            body |= inside
     thick = opened(body)
     thin = body & ~thick
     fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet

@@ -26,6 +26,7 @@ from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
 from stages.core.physics.body_filling import MAX_VOXELS_ALONG, MIN_PARTICLES, STRAY, closed_body, thick_skin
+from stages.core.physics.covered_hull import covered_hull
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -37,6 +38,7 @@ MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
 START = 0.25  # of the object's bounds in their voxel
 CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
+AROUND = 4  # neighbour whose distance is 1 / sqrt(density) in a square lattice, and 1.09 of that at random
 ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
 BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
 
@@ -56,6 +58,7 @@ class SurfaceCloud(NamedTuple):
 
     points: np.ndarray  # (n, 3)
     gap: float  # between points, which is closed
+    hull: np.ndarray | None  # planes (f, 4) of the convex hull, where that is the surface
     others: np.ndarray | None  # (k, 3) points of other objects, where its unseen sides are missing
 
 
@@ -73,14 +76,14 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     extent = max(float((c.points.max(0) - c.points.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(c.gap for c in clouds) / 8, 1e-4 * scene_size(scene), 1e-9)
-    h = max(extent / 40, finest)
-    for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
+    h, ratio = max(extent / 40, finest), 1.0
+    for _ in range(5):
+        h = max(h * min(max(ratio, 0.1), 10) ** 0.4, finest)  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
         solids = parallel_map(lambda cloud, h=h: _solid(scene, cloud, h, skin), clouds)
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
             break
-        h = max(h * min(max(ratio, 0.1), 10) ** 0.4, finest)
     rng = np.random.default_rng(seed)
     points = [(v + 0.5 + 0.5 * (rng.random(v.shape) - 0.5)) * h for v in voxels]
     body = torch.arange(len(points)).repeat_interleave(torch.tensor([len(p) for p in points]))
@@ -168,13 +171,15 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     lower bounds are within the first ones, so that rounding does not decide in which voxels flat sides are. Raises
     InputError for an object without any usable Gaussian.
     """
-    points, gap = _cloud(scene, object_id, seed)
+    points, gap, hull = _cloud(scene, object_id, seed)
     spacing = _usable_spacing(scene, object_id)
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
     origin = first - h / 2
     floor = scene.floor - origin[2] if _stands(points, h, scene.floor) else None
-    body, low = closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin))
+    if hull is not None:
+        hull = np.column_stack([hull[:, :3], hull[:, 3] + hull[:, :3] @ origin])
+    body, low = closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin), hull)
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
@@ -184,7 +189,7 @@ def _solid(scene: Scene, cloud: SurfaceCloud, h: float, skin: bool) -> tuple[np.
     it stood when photographed.
     """
     stands = _stands(cloud.points, h, scene.floor)
-    body, low = closed_body(cloud.points, h, cloud.gap, scene.floor if stands else None, cloud.others)
+    body, low = closed_body(cloud.points, h, cloud.gap, scene.floor if stands else None, cloud.others, cloud.hull)
     photographed = scene.cameras is not None  # so the objects were at rest
     extended = photographed and stands and _topples(body)
     if extended:
@@ -217,10 +222,12 @@ def _topples(body: np.ndarray) -> bool:
 
 
 @cached_in_scene
-def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float]:
-    """`surface_points` of an object, and the gap between them that is closed."""
-    points = surface_points(scene, object_id, seed)
-    return points, max(_gap(points), CLOSED * _usable_spacing(scene, object_id))
+def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float, np.ndarray | None]:
+    """`surface_points` of an object, the gap between them that is closed, and its `covered_hull`."""
+    points, means = surface_points(scene, object_id, seed), usable_means(scene, object_id).double()
+    around = _spacing(means, AROUND)
+    hull = covered_hull(means[inliers(means)].numpy(), around) if around else None
+    return points, max(_gap(points), CLOSED * _usable_spacing(scene, object_id)), hull
 
 
 @cached_in_scene
@@ -229,12 +236,12 @@ def _usable_spacing(scene: Scene, object_id: int) -> float:
     return _spacing(usable_means(scene, object_id).double())
 
 
-def _spacing(means: Float[Tensor, "n 3"]) -> float:
-    """Median distance of Gaussians to the nearest other; 0 for one alone or none."""
-    if len(means) < 2:
+def _spacing(means: Float[Tensor, "n 3"], neighbour: int = 1) -> float:
+    """Median distance of Gaussians to the k-th nearest other; 0 where there are not so many."""
+    if len(means) <= neighbour:
         return 0.0
     some = means[:: max(1, len(means) // 2000)]
-    _, index = knn(means, some, 2)
+    _, index = knn(means, some, neighbour + 1)
     return float((some - means[index[:, -1]]).norm(dim=1).median())
 
 

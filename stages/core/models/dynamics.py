@@ -9,7 +9,7 @@ model.points(scene, state)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -75,6 +75,10 @@ class Dynamics(nn.Module, ABC):
         rate = self.derivative(scene, t, state, external)
         return type(state)(*(y + dt * dy for y, dy in zip(state, rate, strict=True)))
 
+    def stepping(self, scene: Any, dt: float, external: ExternalForces) -> Callable[[tuple, Tensor | float], tuple]:
+        """`step` as a function of state and time, for many steps with the same other arguments."""
+        return lambda state, t: self.step(scene, state, t, dt, external)
+
     def advance(
         self, scene: Any, state: tuple, interval: tuple[Tensor, float], external: ExternalForces, method: str = "step"
     ) -> tuple:
@@ -117,10 +121,11 @@ class Dynamics(nn.Module, ABC):
     ) -> Iterator[tuple]:
         """The states of each frame by `step`; `grid`: frames, time between them [s], steps of each."""
         frames, dt, substeps = grid
+        step = self.stepping(scene, dt / substeps, external)
         yield state
         for frame in range(frames - 1):
             for i in range(substeps):
-                state = self.step(scene, state, dt * (frame + i / substeps), dt / substeps, external)
+                state = step(state, dt * (frame + i / substeps))
             yield state
 
 

@@ -107,6 +107,20 @@ def test_rollout_equals_repeated_steps(name):
     )
 
 
+@torch.no_grad()
+def test_steps_of_a_rollout_are_prepared_once(name, monkeypatch):
+    initial, model, lengths = overlapping_objects(), small_model(name), []
+    expected, stepping = model.rollout(initial, STEPS, integration=Integration(substeps=2)), model.stepping
+
+    def counted(scene, dt, external):
+        lengths.append(dt)
+        return stepping(scene, dt, external)
+
+    monkeypatch.setattr(model, "stepping", counted)
+    assert torch.equal(model.rollout(initial, STEPS, integration=Integration(substeps=2)), expected)
+    assert lengths == [0.01]
+
+
 @pytest.mark.parametrize("name", [n for n in SMALL_CONFIGS if n != "ngff"])
 @torch.no_grad()
 def test_step_of_baselines_is_explicit_euler(name):

@@ -107,6 +107,40 @@ def test_repeated_recordings_are_bitwise_equal():
 
 
 @torch.no_grad()
+def test_rollout_equals_single_steps_with_the_present_weights():
+    model, initial = (
+        model_with_amplified_forces(64).float(),
+        overlapping_objects(2, 3, 200).to(torch.float32).to("cuda"),
+    )
+    external, rollouts = ExternalForces.none(initial), []
+    for _ in range(2):
+        rollouts.append(model.rollout(initial, 5))
+        scene = model.prepare(initial)
+        state = model.initial_state(scene)
+        for i in range(4):
+            state = model.step(scene, state, 0.02 * i, 0.02, external)
+        assert torch.equal(rollouts[-1][:, -1], model.points(scene, state))
+        model.load_state_dict({name: 0.9 * x for name, x in model.state_dict().items()})
+    assert (rollouts[1] - rollouts[0]).abs().max() > 1e-4
+
+
+@torch.no_grad()
+def test_step_follows_weights_changed_in_place():
+    model, initial = (
+        model_with_amplified_forces(64).float(),
+        overlapping_objects(1, 3, 200).to(torch.float32).to("cuda"),
+    )
+    scene, external = model.prepare(initial), ExternalForces.none(initial)
+    state, step = model.initial_state(scene), model.stepping(scene, 0.02, external)
+    assert isinstance(step, fused_step.FusedStep)
+    before = step(state, 0.0)
+    model.load_state_dict({name: 0.9 * x for name, x in model.state_dict().items()})
+    after, expected = step(state, 0.0), model.step(scene, state, 0.0, 0.02, external)
+    assert all(torch.equal(x, y) for x, y in zip(after, expected, strict=True))
+    assert not torch.equal(after.velocity, before.velocity)
+
+
+@torch.no_grad()
 def test_collision_conserves_linear_and_angular_momentum():
     model = model_with_amplified_forces(64).float()
     large_box = torch.tensor([[-9.0] * 3, [9.0] * 3]).expand(1, 3, 2, 3)

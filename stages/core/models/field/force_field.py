@@ -8,6 +8,7 @@ Learned: the contact forces, the deformation and its stiffness.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -188,6 +189,14 @@ class ForceField(Dynamics):
             with small_operations():
                 return self._split_step(scene, state, t, dt, external)
         return self._split_step(scene, state, t, dt, external)
+
+    def stepping(
+        self, scene: FieldScene, dt: float, external: ExternalForces
+    ) -> Callable[[BodyState, Tensor | float], BodyState]:
+        """As that of Dynamics; what the fused steps have in common is collected once."""
+        if self._use_fused_step(scene):
+            return fused_step.FusedStep(self, scene, dt, external)
+        return super().stepping(scene, dt, external)
 
     def _split_step(
         self, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces

@@ -68,7 +68,7 @@ def step(
     field: nn.Module, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
 ) -> BodyState:
     """`ForceField.step` in single precision, without gradients; `field` is the ForceField."""
-    return _Step(field, scene, external, dt).run(state, t)
+    return FusedStep(field, scene, dt, external)(state, t)
 
 
 def points(scene: FieldScene, state: BodyState) -> Tensor:
@@ -106,25 +106,10 @@ class _Layers(NamedTuple):
     deformation: deformation_features.DeformationLayers
 
 
-def _layers(field: nn.Module, scene: FieldScene) -> _Layers:
-    """The layers of a field, collected once for each scene, whose embeddings depend on them as well.
-
-    Weights may change in place, but not be replaced.
-    """
-    precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
-    held, key = scene.__dict__.setdefault("_layers", {}), (field, precision)  # apart from the fields, which are frozen
-    if key not in held:
-        held[key] = _collect(field, tl.constexpr(precision))
-    return held[key]
-
-
-def _collect(field: nn.Module, precision: tl.constexpr) -> _Layers:
-    hidden, pairs, planes, deformation = (
-        tl.constexpr(field.config["hidden"]),
-        field.pairs,
-        field.planes,
-        field.deformation,
-    )
+def _collect_layers(field: nn.Module) -> _Layers:
+    precision = tl.constexpr("tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32")
+    hidden = tl.constexpr(field.config["hidden"])
+    pairs, planes, deformation = field.pairs, field.planes, field.deformation
 
     def encoder(net: ContactNet, vectors: int, scalars: int) -> contact_messages.ContactEncoder:
         return contact_messages.ContactEncoder(_linear(net.input_layer), _network(net.message), tl.constexpr(vectors),
@@ -151,10 +136,14 @@ def _collect(field: nn.Module, precision: tl.constexpr) -> _Layers:
     )  # fmt: skip
 
 
-class _Step:
-    """Sizes, contiguous inputs and the four groups of kernel launches of one step."""
+class FusedStep:
+    """Step of one rollout as a function of state and time, of four groups of kernel launches.
 
-    def __init__(self, field: nn.Module, scene: FieldScene, external: ExternalForces, dt: float):
+    It holds what all steps have in common: sizes, contiguous inputs and layers. The weights may change in place while
+    it is used; what it is made from must not change otherwise.
+    """
+
+    def __init__(self, field: nn.Module, scene: FieldScene, dt: float, external: ExternalForces):
         self.scene, self.external = scene, external
         self.b, self.o, self.n, _ = scene.shape.arm.shape
         self.objects = self.b * self.o
@@ -169,11 +158,11 @@ class _Step:
         arrays = {name: x.contiguous() for name, x in arrays.items()}
         block = tl.constexpr(max(64, triton.next_power_of_2(self.n)))
         self.inputs = bodies.StepInputs(**arrays, o=self.o, n=self.n, dt=dt, BLOCK=block)
-        self.layers = _layers(field, scene)
+        self.layers = _collect_layers(field)
         self.segments = segment_sizes(self.o, self.n)
         self.blocks = sum(self.segments) // ROWS
 
-    def run(self, state: BodyState, t: Tensor | float) -> BodyState:
+    def __call__(self, state: BodyState, t: Tensor | float) -> BodyState:
         drifted = self._drift(state)
         lists = self._contacts(drifted)
         messages = self._messages(lists)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -17,7 +17,9 @@ from torch import Tensor, nn
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
+from stages.core.models.hub import find_or_download
 from stages.core.models.pi3 import memory
+from stages.core.models.pi3.download import download
 from stages.core.models.pi3.network import Geometry, halve
 from stages.core.models.pi3.splat import Pi3Splat, splat
 from stages.core.models.pi3.weights import find, load
@@ -64,20 +66,9 @@ def _predict_geometry(
     name: str, images: Float[Tensor, "v 3 h w"], options: ReconstructOptions, device: str
 ) -> tuple[Geometry, Tensor | None]:
     """Output of the network; the raw Gaussian parameters are None for π³."""
-    model = load(_weights(name, options), name)
+    weights = find_or_download(partial(find, name), partial(download, name), options.weights, options.download)
+    model = load(weights, name)
     return predict(model, images, device)
-
-
-def _weights(name: str, options: ReconstructOptions) -> Path:
-    """The file of weights; with --download it is fetched where missing."""
-    try:
-        return find(name, options.weights)
-    except InputError:
-        if not options.download or options.weights is not None:
-            raise
-    from stages.core.models.pi3.download import download
-
-    return download(name)
 
 
 @torch.no_grad()

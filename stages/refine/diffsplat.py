@@ -11,8 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from stages.core.backends import choose, pick_device
-from stages.core.errors import InputError
-from stages.core.models.diffsplat.weights import Files, find, load
+from stages.core.models.diffsplat.download import download as fetch
+from stages.core.models.diffsplat.weights import find, load
+from stages.core.models.hub import find_or_download
 from stages.core.perception.observed_space import ObservedSpace
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
@@ -69,20 +70,9 @@ def complete(
 @lru_cache(maxsize=1)
 def _model(weights: Path | None, download: bool, device: str):
     """The network, loaded once for all objects; downloaded first if that was requested and it is missing."""
-    return load(_files(weights, download), device)
+    return load(find_or_download(find, fetch, weights, download), device)
 
 
 def weights_file() -> Path:
     """Path of DiffSplat's decoder weights, as an example of its files; raises InputError where some are missing."""
     return find().gsvae
-
-
-def _files(weights: Path | None, download: bool) -> Files:
-    try:
-        return find(weights)
-    except InputError:
-        if not download or weights is not None:
-            raise
-    from stages.core.models.diffsplat.download import download as fetch
-
-    return fetch()

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.models.hub import find_or_download
 from stages.core.models.sam2 import weights as published
 from stages.core.scene.images import write_png
 from stages.core.scene.scene_ply import read_scene
@@ -99,11 +100,15 @@ def test_missing_weights_are_reported(scene_file, tmp_path, monkeypatch):
 def test_weights_are_downloaded_only_on_request_and_if_missing(weights, tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(published, "download", lambda: Path("fetched"))
-    assert published.weights_file(None, True) == Path("fetched")
-    assert published.weights_file(weights, True) == weights / "model.safetensors"
-    with pytest.raises(InputError, match="no config.json"):
-        published.weights_file(tmp_path, True)
+
+    def found(given: Path | None, wanted: bool) -> Path:
+        return find_or_download(published.find, lambda: Path("fetched"), given, wanted)
+
+    assert found(None, True) == Path("fetched")
+    assert found(weights, True) == weights / "model.safetensors"
+    for given, wanted in ((tmp_path, True), (None, False)):
+        with pytest.raises(InputError, match="no config.json"):
+            found(given, wanted)
 
 
 def test_photos_of_another_aspect_ratio_are_refused(scene_file, truth, weights, photos, tmp_path):

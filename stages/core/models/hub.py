@@ -7,11 +7,13 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import sha256
 
 log = logging.getLogger(__name__)
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,21 @@ def folders() -> list[Path]:
     given = os.environ.get("NGFF_WEIGHTS")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngff"
     return [*([Path(given)] if given else []), cache]
+
+
+def find_or_download(
+    find: Callable[[Path | None], Found], download: Callable[[], Found], given: Path | None, wanted: bool
+) -> Found:
+    """What `find(given)` finds; if that is missing and `wanted`, downloaded, unless it was to be where it was `given`.
+
+    Raises the InputError of `find` or `download`.
+    """
+    try:
+        return find(given)
+    except InputError:
+        if not wanted or given is not None:
+            raise
+    return download()
 
 
 def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.core.errors import InputError, MissingPackage
-from stages.core.models.hub import HubSource, fetch, folders
+from stages.core.models.hub import HubSource, fetch, find_or_download, folders
 from stages.core.models.pi3.weights import read_state
 from stages.core.scene.files import must_exist
 
@@ -47,7 +47,7 @@ def load_segmenter(given: Path | None, download_missing: bool, device: str) -> P
 
     Memory: the weights, about 1 GB of activations, one photo, and 20 MB per object, for any number of photos.
     """
-    return _loaded(weights_file(given, download_missing), device)
+    return _loaded(find_or_download(find, download, given, download_missing), device)
 
 
 @lru_cache(maxsize=1)
@@ -56,16 +56,6 @@ def _loaded(path: Path, device: str) -> PromptableSegmenter:
     from stages.core.models.sam2.segmenter import Sam2Segmenter
 
     return Sam2Segmenter(model)
-
-
-def weights_file(given: Path | None, download_missing: bool) -> Path:
-    """As `find`; downloaded first if that was requested and they are missing, unless they were to be those `given`."""
-    try:
-        return find(given)
-    except InputError:
-        if not download_missing or given is not None:
-            raise
-    return download()
 
 
 def download() -> Path:

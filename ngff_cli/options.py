@@ -31,8 +31,8 @@ OutWithTable = Annotated[
     Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
-SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
-                "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
+SIZE_OPTIONS = ("--quality", "--resolution", "--keypoints", "--max-objects", "--batch", "--views", "--side", "--size",
+                "--particles", "--scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
 INTERRUPTED = "interrupted; no incomplete file is left"
 OUT_OF_MEMORY = "{} is out of memory: close other programs that use it"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
@@ -243,10 +243,10 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 def _less_memory(what: str, command, remedies: list[str]) -> str:
     """Sentence for a command that ran out of memory: which of its options to lower, and what else helps."""
-    names = [p.name for p in command.params]
-    sizes = ["--" + name.replace("_", "-") for name in SIZE_OPTIONS if name in names]
+    options = {option for parameter in command.params for option in parameter.opts}
+    sizes = [option for option in SIZE_OPTIONS if option in options]
     lower = [f"lower {' or '.join(sizes)}"] if sizes else []
-    remedies = remedies if "device" in names else []
+    remedies = remedies if "--device" in options else []
     return ", ".join([OUT_OF_MEMORY.format(what), *lower, *remedies])
 
 

@@ -221,6 +221,17 @@ def test_out_of_memory_gives_one_line_and_status_1(monkeypatch, allocate):
     assert line.endswith("the machine is out of memory: close other programs that use it, lower --resolution")
 
 
+def test_out_of_memory_names_only_options_that_the_command_has(monkeypatch):
+    """`bench track` shows its field `quality` as --reconstructed."""
+
+    def exhausted(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("stages.lab.bench.track.run", exhausted)
+    status, _, err = call("bench", "track", app=lab_app)
+    assert status == 1 and err.strip() == "ngff: the machine is out of memory: close other programs that use it"
+
+
 def test_out_of_memory_before_a_command_begins_gives_one_line(capsys):
     def app(words):
         raise ImportError("x.so: failed to map segment from shared object")

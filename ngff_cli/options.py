@@ -17,6 +17,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
+from stages.core.backends import load
 from stages.core.errors import InputError
 
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
@@ -32,7 +33,7 @@ OutWithTable = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("--quality", "--resolution", "--keypoints", "--max-objects", "--batch", "--views", "--side", "--size",
-                "--particles", "--scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
+                "--particles", "--scenes")  # that determine a command's memory, the most effective first  # fmt: skip
 INTERRUPTED = "interrupted; no incomplete file is left"
 OUT_OF_MEMORY = "{} is out of memory: close other programs that use it"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
@@ -181,7 +182,7 @@ def add_benchmark(
     def benchmark(*, options, out=default, as_json=False) -> None:
         print_results(lambda path: load(run)(path, options), out, as_json)
 
-    benchmark.__doc__ = help
+    benchmark.__doc__, benchmark.run = help, run
     benchmark.__annotations__ = {"options": options, "out": out, "as_json": AsJson}
     app.command(name)(with_options(benchmark))
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import typing
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,21 @@ def test_options_of_a_command_are_the_fields_of_its_classes():
     for wrong in (["--few", 6], ["--inner", 1], ["--no-flag"]):
         assert call("a", *wrong, app=own)[0] == 2
     assert "up to five" in call("--help", app=own)[1]
+
+
+BENCHMARKS = [
+    (line.split()[-1], bench) for line, callback in COMMANDS.items() if (bench := getattr(callback, "run", ""))
+]
+
+
+@pytest.mark.parametrize(("name", "run"), BENCHMARKS)
+def test_benchmarks_run_what_they_name(name, run, monkeypatch):
+    module, function = run.split(":")
+    assert callable(getattr(import_module(module), function))
+    seen = []
+    monkeypatch.setattr(f"{module}.{function}", lambda path, options: seen.append((path, options)) or ["a line"])
+    status, out, _ = call("bench", name, app=lab_app)
+    assert status == 0 and out == "a line\n" and len(seen) == 1
 
 
 def test_options_that_are_given_are_told_from_those_that_are_not(monkeypatch, tmp_path):

@@ -100,8 +100,9 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
                 spec.add_exclude(bodyname1=one, bodyname2=two)
     try:
         return spec.compile()
-    except RuntimeError as error:
-        if "unknown exception" in str(error):  # which is what its Python bindings make of std::bad_alloc
+    except (RuntimeError, ValueError) as error:
+        # what it makes of std::bad_alloc, and of Qhull without memory: the hulls are of Qhull already
+        if "unknown exception" in str(error) or "qhull error" in str(error):
             raise MemoryError("MuJoCo cannot compile the model") from error
         raise
 

@@ -467,11 +467,12 @@ def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
     assert taken == pytest.approx([2.0, *(2.0 - 0.5 * s for s in slips[: passes - 1])])
 
 
-def test_a_model_for_which_memory_is_short_is_out_of_memory(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [RuntimeError("Caught an unknown exception!"), ValueError("Error: qhull error")])
+def test_a_model_for_which_memory_is_short_is_out_of_memory(tmp_path, monkeypatch, error):
     """MuJoCo raises RuntimeError for any exception of C++ that it does not know."""
 
     def compile(spec):
-        raise RuntimeError("Caught an unknown exception!")
+        raise error
 
     monkeypatch.setattr(pytest.importorskip("mujoco").MjSpec, "compile", compile)
     with pytest.raises(MemoryError):

@@ -16,8 +16,7 @@ def ngff_lab() -> None:
 
 def _start(module: str) -> None:
     try:
-        main = import_module(module).main
-    except KeyboardInterrupt:  # later ones are caught by main
+        import_module(module).main()
+    except KeyboardInterrupt:  # before main catches it
         print("ngff: interrupted", file=sys.stderr)
         sys.exit(130)
-    main()

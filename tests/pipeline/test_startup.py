@@ -89,15 +89,15 @@ def test_commands_do_not_import_what_they_do_not_use(inputs, device, chosen):
 
 
 @pytest.mark.parametrize("script", ["ngff", "ngff_lab"])
-def test_an_interrupt_while_the_command_line_is_imported_ends_in_one_line(script):
+@pytest.mark.parametrize("interrupted", ["builtins.__import__", "signal.signal"])
+def test_an_interrupt_before_the_command_line_catches_it_ends_in_one_line(script, interrupted):
+    """While it is imported, and just after."""
     code = f"""
-import sys
-class Interrupting:
-    def find_spec(self, name, *_):
-        if name == "typer":
-            raise KeyboardInterrupt
-sys.meta_path.insert(0, Interrupting())
+import builtins, signal, sys
 from ngff_cli import {script}
+def interrupt(*_):
+    raise KeyboardInterrupt
+{interrupted} = interrupt
 {script}()
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)

@@ -11,10 +11,11 @@ FLAGS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+LONGEST = 120.0  # for which a busy machine is waited for [s]
 SIZE = {"width": 480, "height": 360}  # of the window [px]
 
 
-def until(page, condition: str, seconds: float = 20.0) -> None:
+def until(page, condition: str, seconds: float = LONGEST) -> None:
     """Wait until a JavaScript expression is true; the page's policy forbids playwright's own way, which needs eval."""
     end = time.monotonic() + seconds
     while not page.evaluate(condition):
@@ -44,6 +45,7 @@ def chromium(tmp_path_factory):
             profile, executable_path=path, args=FLAGS, headless=True, viewport=SIZE,
             env={**os.environ, "HOME": str(profile)},
         )  # fmt: skip
+        context.set_default_timeout(1000 * LONGEST)
         yield context
         context.close()
 

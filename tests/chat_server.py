@@ -27,8 +27,8 @@ class Server(ThreadingHTTPServer):
         self.url = f"http://127.0.0.1:{self.server_address[1]}/v1"
 
     def wait_for(self, requests: int) -> None:
-        """Until so many have been read, at most 10 s: a client may give up before a busy machine reads its request."""
-        for _ in range(1000):
+        """Until so many have been read, at most 2 min: a client may give up before a busy machine reads its request."""
+        for _ in range(12_000):
             if len(self.asked) >= requests:
                 break
             time.sleep(0.01)

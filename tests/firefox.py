@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.browser import LONGEST
+
 PREFERENCES = {
     "webgl.force-enabled": True,
     "app.normandy.enabled": False,
@@ -49,7 +51,7 @@ class FirefoxPage:
         number = next(self._number)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=LONGEST))
             if message.get("id") == number:
                 assert message["type"] == "success", message
                 return message["result"]

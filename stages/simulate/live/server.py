@@ -146,9 +146,10 @@ class LiveServer:
             pass
         finally:
             controlled = self._clients[0] is client
-            self._clients.remove(client)
             if controlled:
                 self._put({"do": "release"})  # a drag ends with the client that made it
+            self._clients.remove(client)
+            if controlled:
                 self._tell_roles()
 
     def _receive(self, client: Client, text: str | bytes) -> bool:

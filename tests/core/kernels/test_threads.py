@@ -10,6 +10,8 @@ import warp as wp
 from stages.core.backends import pick_device
 from stages.core.kernels.threads import large_operation, parallel_map, run_parallel, small_operations
 
+LONGEST = 120.0  # for which a busy machine is waited for [s]
+
 
 @pytest.fixture(params=[1, 2, 4])
 def threads(request):
@@ -36,7 +38,7 @@ def test_results_are_in_the_order_of_the_items(threads):
 def test_tasks_have_the_gradient_mode_of_the_caller(threads, mode):
     with mode():
         expected = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-        barrier = threading.Barrier(threads, timeout=10)  # so that every thread takes a task
+        barrier = threading.Barrier(threads, timeout=LONGEST)  # so that every thread takes a task
 
         def task(_) -> tuple[bool, bool]:
             barrier.wait()
@@ -51,7 +53,7 @@ def test_tasks_have_the_current_gpu_of_the_caller(threads, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: getattr(own, "gpu", 0))
     monkeypatch.setattr(torch.cuda, "set_device", lambda gpu: setattr(own, "gpu", gpu))
-    barrier = threading.Barrier(threads, timeout=10)  # so that every thread takes a task
+    barrier = threading.Barrier(threads, timeout=LONGEST)  # so that every thread takes a task
 
     def task(_) -> int:
         barrier.wait()
@@ -65,7 +67,7 @@ def test_tasks_have_the_current_gpu_of_the_caller(threads, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two NVIDIA GPUs")
 def test_tasks_compute_on_the_gpu_of_the_caller(threads):
-    barrier = threading.Barrier(threads, timeout=10)
+    barrier = threading.Barrier(threads, timeout=LONGEST)
 
     def task(_) -> tuple[int, str]:
         barrier.wait()
@@ -99,9 +101,9 @@ def test_the_calling_thread_does_the_work_that_no_helper_has_claimed(threads):
     def block():
         if threading.current_thread().name == "kernels":
             occupied.release()
-            release.wait(10)
+            release.wait(LONGEST)
         else:
-            all_busy.wait(10)
+            all_busy.wait(LONGEST)
 
     def occupy():
         run_parallel([block] * threads)
@@ -109,13 +111,13 @@ def test_the_calling_thread_does_the_work_that_no_helper_has_claimed(threads):
     other = threading.Thread(target=occupy)
     other.start()
     for _ in range(threads - 1):
-        assert occupied.acquire(timeout=10)
+        assert occupied.acquire(timeout=LONGEST)
     all_busy.set()
     done = []
     run_parallel([lambda: done.append(threading.current_thread().name)] * 4)
     assert done == [threading.current_thread().name] * 4
     release.set()
-    other.join(10)
+    other.join(LONGEST)
     assert not other.is_alive()
 
 

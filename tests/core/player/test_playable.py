@@ -193,7 +193,7 @@ def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, o
     page.set_viewport_size({"width": 800, "height": 400})
     page.evaluate(f"player.play(false); player.seek({first} * player.film.dt)")
     still = "!player.changed && !player.busy && player.drawn()"
-    until(page, still, 60)
+    until(page, still)
     x, y = page.evaluate(FIND)
     page.evaluate("player.live.act({ do: 'pause', value: true })")
     until(page, "player.live.state?.paused")
@@ -204,12 +204,12 @@ def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, o
         page.mouse.move(x, y - 16 * i)
         page.keyboard.press(".")
     page.mouse.up()
-    until(page, f"player.live.state.frames === {frames} && {still}", 60)
+    until(page, f"player.live.state.frames === {frames} && {still}")
     assert page.evaluate(RISE) > 0.05
     page.mouse.move(*page.evaluate(FIND))
     for key in "p.n..":
         page.keyboard.press(key)
-    until(page, f"player.live.state.frames === {frames + 3}", 60)
+    until(page, f"player.live.state.frames === {frames + 3}")
     with page.expect_download() as download:
         page.keyboard.press("x")
     download.value.save_as(tmp_path / "done.json")

@@ -324,7 +324,7 @@ def test_two_processes_equal_one_with_the_whole_batch(data, tmp_path):
         for i in range(2)
     ]  # fmt: skip
     for process in crew:
-        error = process.communicate(timeout=120)[1]
+        error = process.communicate(timeout=600)[1]
         assert process.returncode == 0, error
     (one, _), (two, card) = (load(tmp_path / f"{name}.safetensors") for name in ("one", "two"))
     assert card["runs"][0]["processes"] == 2 and card["runs"][0]["steps"] == 6

@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import Field, fields, is_dataclass
-from functools import wraps
+from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -204,6 +204,15 @@ class CommandGroup(typer.core.TyperGroup):
             command.short_help = (command.help or "").split("\n\n")[0]
         return command
 
+    def resolve_command(self, ctx, args):
+        """The command that is to run, which refuses empty paths: as a Path they are the current folder."""
+        name, command, rest = super().resolve_command(ctx, args)
+        kinds = get_type_hints(command.callback) if command is not None and command.callback else {}
+        for parameter in command.params if kinds else []:
+            if Path in (kinds[parameter.name], *get_args(kinds[parameter.name])):
+                parameter.process_value = partial(_path_of, parameter)
+        return name, command, rest
+
     def invoke(self, ctx):
         """Run the command; turn errors that a user can correct into one line on stderr."""
         try:
@@ -215,7 +224,7 @@ class CommandGroup(typer.core.TyperGroup):
         except KeyboardInterrupt:
             fail(INTERRUPTED, 130)
         except Exception as error:
-            command = self.commands[ctx.invoked_subcommand]
+            command = self.commands.get(ctx.invoked_subcommand, self)  # not one that does not exist
             if _is_gpu_out_of_memory(error):
                 fail(_less_memory("the GPU", command, ["use --device cpu"]), 1)
             if _is_out_of_memory(error):
@@ -224,6 +233,14 @@ class CommandGroup(typer.core.TyperGroup):
                 raise
             where = f"{error.filename}: " if error.filename else ""
             fail(f"{where}{error.strerror or error}", 2)
+
+
+def _path_of(parameter, ctx, value):
+    """The value of a parameter whose type is Path, or the values of one that is repeatable."""
+    if "" in (value if isinstance(value, (list, tuple)) else [value]):
+        name = parameter.metavar if parameter.param_type_name == "argument" else parameter.opts[-1]
+        raise InputError(f"{name}: the path is empty; give the path of a file or folder, or . for the current folder")
+    return type(parameter).process_value(parameter, ctx, value)
 
 
 def _is_gpu_out_of_memory(error: Exception) -> bool:

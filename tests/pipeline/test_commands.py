@@ -143,6 +143,25 @@ def test_every_command_and_option_is_documented(name):
     assert all(hint.__metadata__[0].help for option, hint in hints.items() if option not in ("return", "context"))
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_empty_path_is_an_error(name):
+    """Path("") would be the current folder."""
+    script, *words = name.split()
+    script = {"ngff": app, "ngff-lab": lab_app}[script]
+    command = typer.main.get_command(script)
+    for word in words:
+        command = command.commands[word]
+    hints, before = typing.get_type_hints(COMMANDS[name]), []
+    for parameter in command.params:
+        is_option = parameter.param_type_name == "option"
+        if Path in (hints[parameter.name], *typing.get_args(hints[parameter.name])):
+            given = [parameter.opts[0], ""] if is_option else [*before, ""]
+            status, _, err = call(*words, *given, app=script)
+            assert status == 2 and err.startswith("ngff: ") and "the path is empty" in err, (given, err)
+        if not is_option:
+            before.append("x")
+
+
 @pytest.mark.parametrize("name, script", [("ngff", app), ("ngff-lab", lab_app)], ids=["ngff", "ngff-lab"])
 def test_shell_completion(name, script, monkeypatch):
     variable = f"_{name.replace('-', '_').upper()}_COMPLETE"

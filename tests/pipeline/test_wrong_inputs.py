@@ -111,6 +111,12 @@ def test_wrong_input_gives_one_line_and_status_2(line):
     fails_cleanly(line)
 
 
+@pytest.mark.parametrize("words", [["foo"], [""], ["bench", "foo"]])
+def test_a_command_that_does_not_exist_is_an_error_of_usage(words):
+    status, _, err = call(*words, app=lab_app)
+    assert status == 2 and f"Error: No such command '{words[-1]}'" in err
+
+
 def test_an_error_is_one_line_below_the_progress_bar(capsys):
     bar = iter(tqdm(range(3), file=sys.stderr))
     next(bar)
@@ -132,7 +138,7 @@ SOURCES = {"evaluate": "good.h5 --against good.h5"}  # of the other stages good.
 
 
 @pytest.mark.parametrize(("out", "message"), [("nowhere/o{}", "no folder"), ("empty", "is a folder"),
-                                              ("", "is a folder"), (".", "is a folder")])  # fmt: skip
+                                              ("", "--out: the path is empty"), (".", "is a folder")])  # fmt: skip
 @pytest.mark.parametrize("stage", WORK)
 def test_an_output_that_cannot_be_written_is_reported_before_the_work(stage, out, message, monkeypatch):
     if stage == "render" and message == "is a folder":

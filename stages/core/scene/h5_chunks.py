@@ -2,7 +2,8 @@
 
 The files are those that HDF5 writes with its filters shuffle (the first bytes of all values, then the second ones, and
 so on) and gzip: chunks are encoded and decoded here, and written and read unfiltered (direct chunk I/O). ISA-L
-compresses what is stored here some ten times as fast as zlib, to the same format.
+compresses what is stored here some ten times as fast as zlib, to the same format. HDF5 unpacks any amount from a chunk,
+which may be a bomb; what is not decoded here is to be checked first.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from isal import isal_zlib
 LEVEL = 2  # of ISA-L, 0 to 3; what HDF5 itself compresses has zlib's level of this number
 COMPRESSED = {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 CHUNK_BYTES = 1 << 18
-FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE)
+SHUFFLE, GZIP, CHECKSUM = h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32
+READABLE = {SHUFFLE, GZIP, CHECKSUM, h5py.h5z.FILTER_LZF}
 
 
 def write_compressed(file: h5py.File, name: str, values: np.ndarray) -> None:
@@ -40,23 +42,58 @@ def append_rows(data: h5py.Dataset, rows: np.ndarray) -> None:
     _write_chunks(data, first, np.split(rows.astype(data.dtype, copy=False), len(rows)))
 
 
-def read_compressed(data: h5py.Dataset) -> np.ndarray:
-    """All values of a dataset; OSError if a chunk is damaged."""
-    if data.chunks is None or data.dtype.kind not in "fiu" or filters_of(data) != FILTERS or not data.size:
-        return data[()]
-    infos = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
-    if any(info.filter_mask for info in infos):
-        return data[()]
-    out, chunks, dtype = np.full(data.shape, data.fillvalue, data.dtype), data.chunks, data.dtype
+def read_compressed(data: h5py.Dataset, row: int | None = None) -> np.ndarray:
+    """All values of a dataset, or of a row of one with several axes; OSError if a chunk is damaged."""
+    if not decoded_here(data) or not data.size:
+        return data[() if row is None else row]
+    filters, chunks, dtype = filters_of(data), data.chunks, data.dtype
+    first, rows = (0, len(data)) if row is None else (row, 1)
+    out = np.full((rows, *data.shape[1:]), data.fillvalue, dtype)
 
     # h5py is called from this thread only: with several threads its lock can deadlock (h5py issue 2920).
-    def place(chunk: tuple[tuple[int, ...], bytes]) -> None:
-        offset, stored = chunk
-        part = out[tuple(slice(a, a + b) for a, b in zip(offset, chunks, strict=True))]
-        part[...] = _decoded(stored, chunks, dtype)[tuple(slice(0, s) for s in part.shape)]
+    def place(chunk: tuple[tuple[int, ...], list[int], bytes]) -> None:
+        (above, *others), used, stored = chunk
+        values = _decoded(stored, used, chunks, dtype)
+        part = out[(slice(max(above - first, 0), max(above + chunks[0] - first, 0)),
+                    *(slice(a, a + b) for a, b in zip(others, chunks[1:], strict=True)))]  # fmt: skip
+        values = values[max(first - above, 0) :]
+        part[...] = values[tuple(slice(0, s) for s in part.shape)]
 
-    _in_threads(place, [(info.chunk_offset, data.id.read_direct_chunk(info.chunk_offset)[1]) for info in infos])
-    return out
+    infos = [i for i in chunks_of(data) if first - chunks[0] < i.chunk_offset[0] < first + rows]
+    _in_threads(place, [(info.chunk_offset, used_filters(filters, info),
+                         data.id.read_direct_chunk(info.chunk_offset)[1]) for info in infos])  # fmt: skip
+    return out if row is None else out[0]
+
+
+def decoded_here(data: h5py.Dataset) -> bool:
+    """Whether `read_compressed` decodes the chunks of a dataset itself."""
+    return data.chunks is not None and data.dtype.kind in "fiu" and filters_of(data) in ((GZIP,), (SHUFFLE, GZIP))
+
+
+def check_chunks(data: h5py.Dataset) -> None:
+    """OSError if a chunk that HDF5 is to decode with gzip is damaged, or larger than its values.
+
+    Not of strings of variable length, for which `h5_text.check_texts` is.
+    """
+    filters = filters_of(data)
+    if GZIP not in filters or data.dtype.kind == "O":
+        return
+    size = int(np.prod(data.chunks)) * data.dtype.itemsize
+    for info in chunks_of(data):
+        used = used_filters(filters, info)
+        while used and used[-1] == CHECKSUM:  # four bytes after the others
+            used.pop()
+        if GZIP in used[:-1]:
+            raise OSError("a chunk is compressed by other filters after gzip")
+        if used and used[-1] == GZIP:
+            _inflated(data.id.read_direct_chunk(info.chunk_offset)[1], size)
+
+
+def chunks_of(data: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:
+    """Offset, place and size of the stored chunks of a dataset, in a time that is linear in their number."""
+    found: list[h5py.h5d.StoreInfo] = []
+    data.id.chunk_iter(found.append)
+    return found
 
 
 def _write_chunks(data: h5py.Dataset, first: int, chunks: list[np.ndarray]) -> None:
@@ -71,22 +108,38 @@ def _encoded(values: np.ndarray) -> bytes:
     return isal_zlib.compress(shuffled, LEVEL)
 
 
-def _decoded(stored: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """The values of a stored chunk; OSError if it is damaged."""
+def _decoded(stored: bytes, used: list[int], shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """The values of a chunk that is stored with some of shuffle and gzip; OSError if it is damaged."""
     size = int(np.prod(shape)) * dtype.itemsize
+    raw = _inflated(stored, size) if GZIP in used else stored
+    if len(raw) != size:
+        raise OSError("a damaged chunk: its size is wrong")
+    values = np.frombuffer(raw, np.uint8)
+    if SHUFFLE in used:
+        values = values.reshape(dtype.itemsize, -1).T.copy()
+    return values.view(dtype).reshape(shape)
+
+
+def _inflated(stored: bytes, size: int) -> bytes:
+    """A chunk without gzip; OSError if it is damaged, or has more than `size` bytes then."""
     try:
         raw = isal_zlib.decompressobj().decompress(stored, size + 1)
     except isal_zlib.error as error:
         raise OSError(f"a damaged chunk: {error}") from error
-    if len(raw) != size:
+    if len(raw) > size:
         raise OSError("a damaged chunk: its size is wrong")
-    return np.frombuffer(raw, np.uint8).reshape(dtype.itemsize, -1).T.copy().view(dtype).reshape(shape)
+    return raw
 
 
 def filters_of(data: h5py.Dataset) -> tuple[int, ...]:
     """Identifiers of the filters of a dataset, in the order in which they are applied."""
     properties = data.id.get_create_plist()
     return tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
+
+
+def used_filters(filters: tuple[int, ...], info: h5py.h5d.StoreInfo) -> list[int]:
+    """Those of a dataset's filters that are applied to a chunk."""
+    return [code for i, code in enumerate(filters) if not info.filter_mask >> i & 1]
 
 
 def _in_threads(function: Callable, items: Iterable) -> list[Any]:

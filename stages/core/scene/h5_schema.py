@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from stages.core.scene.h5_chunks import read_compressed
+from stages.core.scene.h5_chunks import READABLE, check_chunks, decoded_here, filters_of, read_compressed
 from stages.core.scene.h5_text import check_attributes, check_texts
 from stages.core.scene.schema import LARGEST, MAX_DEFLATE_RATIO, Bound, quote
 
@@ -69,11 +69,16 @@ class Dataset:
         kind = "text" if text else data.dtype.kind
         if kind not in {"float": ("f", "i", "u"), "int": ("i", "u"), "text": ("text",)}[self.kind]:
             raise ValueError(f"{name} has values of type {quote(data.dtype, 40)}, not {self.kind}")
-        stored = data.id.get_storage_size()
+        stored = min(data.id.get_storage_size(), file.id.get_filesize())  # the former is what a damaged index says
         if data.size * data.dtype.itemsize > MAX_DEFLATE_RATIO * stored + 4096:
             raise ValueError(f"{name} declares {data.size} values, but the file stores only {stored} bytes of them")
         if data.chunks and math.prod(data.chunks) * data.dtype.itemsize > max(MAX_DEFLATE_RATIO * stored, MAX_CHUNK):
             raise ValueError(f"{name} has chunks of {data.chunks} values, but the file stores only {stored} bytes")
+        for code in filters_of(data):
+            if code not in READABLE:
+                raise ValueError(f"{name} is stored with filter {code} of HDF5, which is not read; write it with gzip")
+        if not decoded_here(data):
+            check_chunks(data)
         lengths.update({s: n for s, n in zip(self.shape.split(), data.shape, strict=True) if s.isalpha()})
         return data
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import h5py
 import numpy as np
 
-from stages.core.scene.h5_chunks import filters_of
+from stages.core.scene.h5_chunks import chunks_of, filters_of, used_filters
 
 ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # types of messages of an object header
 # Classes of datatypes: numbers, texts of fixed length, and enumerations such as booleans; texts of variable length are
@@ -113,9 +113,9 @@ def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
         yield file.read(at, data.size * 16)
         return
     filters, size = filters_of(data), int(np.prod(data.chunks)) * 16
-    for info in (data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())):
+    for info in chunks_of(data):
         part = file.read(info.byte_offset, info.size)
-        used = [code for i, code in enumerate(filters) if not info.filter_mask >> i & 1]
+        used = used_filters(filters, info)
         if used == [h5py.h5z.FILTER_DEFLATE]:
             part = zlib.decompressobj().decompress(part, size + 1)
         elif used:  # shuffle does not apply to strings

@@ -20,7 +20,7 @@ from stages.core.scene.error_deferring_file import ErrorDeferringFile
 from stages.core.scene.field_start import FieldStart, read_field_start, write_field_start
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
-from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
+from stages.core.scene.h5_chunks import COMPRESSED, append_rows, read_compressed, write_compressed
 from stages.core.scene.h5_schema import Dataset, find_link, open_h5
 from stages.core.scene.prompt_rows import read_prompts
 from stages.core.scene.scene import Scene, read_metadata, read_objects
@@ -112,7 +112,8 @@ class Trajectory:
         with h5py.File(self.path, "r") as file:
             names = [f"frames/{name}" for name in ("means", "quats", "scales")]
             try:
-                rows = [torch.from_numpy(DATASETS[name].checked(file[name][t], name)) for name in names]
+                values = (DATASETS[name].checked(read_compressed(file[name], t), name) for name in names)
+                rows = [torch.from_numpy(v) for v in values]
                 _check_unit(rows[1], names[1])
             except (OSError, ValueError) as error:
                 raise InputError(f"{self.path}: frame {t} is damaged ({reason(error)})") from error

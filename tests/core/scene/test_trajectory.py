@@ -1,4 +1,5 @@
 import os
+import zlib
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -253,6 +254,42 @@ def test_values_up_to_the_limits_of_a_dataset_are_read(tmp_path, intact, name, l
             except InputError as error:
                 refused = f"{name} must be" in str(error)
             assert refused is not right, (value, right)
+
+
+def test_filters_that_are_not_read_are_named(tmp_path, intact):
+    path, name = tmp_path / "t.h5", b"keypoints/positions"
+    path.write_bytes(intact)
+    with h5py.File(path, "a") as file:
+        values = file[name][()]
+        del file[name]
+        filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        filters.set_chunk(values.shape)
+        filters.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # Blosc
+        data = h5py.h5d.create(file.id, name, h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple(values.shape), filters)
+        data.write_direct_chunk((0, 0, 0), values.tobytes())
+    with pytest.raises(InputError, match="t.h5.*keypoints/positions is stored with filter 32001 of HDF5.*gzip"):
+        read_trajectory(path)
+
+
+def test_chunks_that_unpack_to_more_than_their_values_are_refused(tmp_path, two_balls, intact):
+    path, bomb = tmp_path / "t.h5", zlib.compress(bytes(1 << 24))
+    path.write_bytes(intact)
+    with h5py.File(path, "a") as file:
+        values = file["objects/name"].asstr()[()].astype("S9")
+        del file["objects/name"]
+        file.create_dataset("objects/name", data=values, compression="gzip").id.write_direct_chunk((0,), bomb)
+    with pytest.raises(InputError, match="t.h5: .*a damaged chunk: its size is wrong"):
+        read_trajectory(path)
+    path.write_bytes(intact)
+    with h5py.File(path, "a") as file:
+        for name in ("means", "quats", "scales"):
+            rows = getattr(two_balls.gaussians, name).numpy()[None].repeat(3, 0)
+            data = file.create_dataset(f"frames/{name}", data=rows, chunks=(1, *rows.shape[1:]), compression="gzip")
+        data.id.write_direct_chunk((1, 0, 0), bomb)
+    t = read_trajectory(path)
+    assert torch.equal(t.frame(2).means, two_balls.gaussians.means)
+    with pytest.raises(InputError, match="t.h5: frame 1 is damaged .a damaged chunk: its size is wrong"):
+        t.frame(1)
 
 
 @pytest.mark.parametrize(("dt", "right"), [(1e-6, True), (9.9e-7, False), (1e4, True), (10_001.0, False)])

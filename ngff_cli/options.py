@@ -60,8 +60,9 @@ def with_options(command: Callable) -> Callable:
     parameters: dict[str, Parameter] = {}
     for name, parameter in signature(command).parameters.items():
         if name in classes:
+            kinds = get_type_hints(classes[name])
             for f in exposed[name]:
-                parameters.setdefault(f.name, _parameter(f, get_type_hints(classes[name])[f.name]))
+                parameters.setdefault(f.name, _parameter(f, kinds[f.name]))
         else:
             parameters[name] = parameter.replace(annotation=hints[name])
 

@@ -63,7 +63,7 @@ def test_voxels_of_a_hull_are_those_with_centres_inside():
     ("sides", "n"), [((0.4, 0.4, 0.05), 2000), ((0.4, 0.4, 0.05), 6000), ((0.5, 0.02, 0.02), 2000)]
 )
 def test_thin_bodies_have_their_volume(sides, n):
-    """As rigid bodies and as particles; the plate of 2,000 points had half of it."""
+    """Also where holes between the points are wider than the body is thick."""
     area = 2 * (sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
     points = torch.from_numpy(box_samples(sides, n)) + torch.tensor([0.0, 0.0, 2.0])
     thing = scene(splats(points, scale=0.4 * (area / n) ** 0.5), floor=0.0)

@@ -11,16 +11,18 @@ import numpy as np
 from stages.core.errors import InputError
 from stages.core.scene.images import import_av, open_video
 from stages.core.scene.recordings import common_frame_rate, list_recordings, read_recording
+from stages.core.scene.schema import reason
 from stages.core.scene.sequence import FilmedSequence
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photo_reader import MAX_SIDES
 from stages.reconstruct.photos import Photos
-from stages.reconstruct.synchronise import find_motion, find_offsets, motion_signal, parse_offsets
+from stages.reconstruct.synchronise import MotionSignal, find_motion, find_offsets, motion_signal, parse_offsets
 
 log = logging.getLogger(__name__)
 MOTION_SIDE = 64  # longest side of the frames in which motion is measured [px]
 SOUND_RATE = 48_000  # samples a second
 LOUDNESS_RATE = 10  # values of the loudness in a frame
+MAX_LATE = 600  # of the sound, after or before the pictures [s]
 
 
 def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, FilmedSequence]:
@@ -30,8 +32,7 @@ def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, Fi
     """
     recordings = list_recordings(folder)
     fps = common_frame_rate(recordings, options.fps)
-    signals = {name: motion_signal([image.numpy() for image, _ in read_recording(path, MOTION_SIDE)])
-               for name, path in recordings.items()}  # fmt: skip
+    signals = {name: _signal(path) for name, path in recordings.items()}
     if options.offsets:
         offsets = parse_offsets(options.offsets, list(recordings))
     elif options.sync == "audio":
@@ -55,6 +56,14 @@ def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, Fi
     return _first_frames(folder, recordings, starts, options), sequence
 
 
+def _signal(path: Path) -> MotionSignal:
+    frames = [image.numpy() for image, _ in read_recording(path, MOTION_SIDE)]
+    if len(frames) < 2:
+        raise InputError(f"{path}: fewer than two frames of it can be read; give a film from before the release on, or "
+                         "remove it")  # fmt: skip
+    return motion_signal(frames)
+
+
 def _first_frames(
     folder: Path, recordings: dict[str, Path], starts: dict[str, float], options: ReconstructOptions
 ) -> Photos:
@@ -71,17 +80,23 @@ def _first_frames(
 def loudness(path: Path, fps: float) -> np.ndarray:
     """Logarithm of the loudness of a video's sound, LOUDNESS_RATE values in each frame from the first frame on.
 
-    Raises InputError for a recording without sound.
+    Raises InputError for a recording without sound, and for one whose sound is damaged.
     """
     if not path.is_file():
         raise InputError(f"{path}: frames have no sound; use --sync motion")
     with open_video(path) as file:
         if not file.streams.audio:
             raise InputError(f"{path}: has no sound; use --sync motion")
-        resampler = import_av(path).AudioResampler(format="flt", layout="mono", rate=SOUND_RATE)
-        parts = [out.to_ndarray()[0] for frame in file.decode(audio=0) for out in resampler.resample(frame)]
+        av = import_av(path)
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=SOUND_RATE)
+        try:
+            parts = [out.to_ndarray()[0] for frame in file.decode(audio=0) for out in resampler.resample(frame)]
+        except (av.FFmpegError, ValueError) as error:
+            raise InputError(f"{path}: its sound cannot be read ({reason(error)}); use --sync motion") from error
         video, audio = (s.start_time or 0 for s in (file.streams.video[0], file.streams.audio[0]))
         late = float(audio * file.streams.audio[0].time_base - video * file.streams.video[0].time_base)
+    if abs(late) > MAX_LATE:
+        raise InputError(f"{path}: its sound begins {late:.0f} s after its pictures; use --sync motion")
     samples = np.concatenate(parts) if parts else np.zeros(0, np.float32)
     shift = round(late * SOUND_RATE)
     samples = np.pad(samples, (shift, 0)) if shift > 0 else samples[-shift:]

@@ -89,6 +89,12 @@ def test_the_frames_at_the_release_are_the_photos(films, tmp_path):
     assert REST <= sequence.frames <= REST + 3
 
 
+def test_a_film_of_one_frame_is_named(films, tmp_path):
+    folder = write_frames(tmp_path / "cameras", {**films, "b": films["b"][:1]})
+    with pytest.raises(InputError, match="b: fewer than two frames of it can be read"):
+        read_sequence(folder, ReconstructOptions(sequence=True, offsets="a=0,b=0,c=0"))
+
+
 def test_offsets_may_be_given(films, tmp_path):
     folder = write_frames(tmp_path / "cameras", films)
     given = ",".join(f"{name}={start}" for name, start in STARTS.items())
@@ -159,6 +165,29 @@ def test_films_are_synchronised_by_sound(tmp_path):
         write_clap(tmp_path / name, start)
     offsets = find_offsets({name: loudness(tmp_path / name, 25) for name in starts}, 10)
     assert offsets["bb.mkv"] == pytest.approx(3.4, abs=0.05)
+
+
+def write_sound(path: Path, codec: str, packet: bytes, late: float = 0.0) -> None:
+    """A film of one frame whose sound is a packet, later than it [s]."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as file:
+        video, audio = file.add_stream("libx264", rate=25), file.add_stream(codec, rate=48_000)
+        video.width, video.height, video.pix_fmt = 16, 16, "yuv420p"
+        file.mux(video.encode(av.VideoFrame.from_ndarray(np.zeros((16, 16, 3), np.uint8), format="rgb24")))
+        file.mux(video.encode())
+        sound = av.Packet(packet)
+        sound.stream, sound.time_base = audio, Fraction(1, 1000)
+        sound.pts = sound.dts = int(1000 * late)
+        file.mux(sound)
+
+
+def test_damaged_and_very_late_sound_is_named(tmp_path):
+    write_sound(tmp_path / "a.mkv", "flac", b"no FLAC" * 20)
+    with pytest.raises(InputError, match="a.mkv: its sound cannot be read .*use --sync motion"):
+        loudness(tmp_path / "a.mkv", 25)
+    write_sound(tmp_path / "b.mov", "pcm_s16le", bytes(200), late=10_000.0)
+    with pytest.raises(InputError, match="b.mov: its sound begins 10000 s after its pictures; use --sync motion"):
+        loudness(tmp_path / "b.mov", 25)
 
 
 def test_frames_have_no_sound(tmp_path):

@@ -14,6 +14,7 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from stages.core.scene.images import list_photos, read_8_bit, read_reduced_video, video_info
+from stages.core.scene.sequence import RATES
 
 
 def list_recordings(folder: Path) -> dict[str, Path]:
@@ -34,8 +35,15 @@ def _is_recording(path: Path) -> bool:
 
 
 def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
-    """Frame rate of all videos [1/s], or `fps` for folders of frames. Raises InputError if the rates differ."""
+    """Frame rate of all videos [1/s], or `fps` for folders of frames.
+
+    Raises InputError if the rates differ, or a video does not say its own.
+    """
     rates = {name: video_info(path)[1] if path.is_file() else fps for name, path in recordings.items()}
+    for name, rate in rates.items():
+        if not RATES[0] <= rate <= RATES[1]:
+            says = f"has {rate:g} frames a second" if rate else "does not say how many frames it has in a second"
+            raise InputError(f"{recordings[name]}: {says}; encode it again with a frame rate")
     name, rate = next(iter(rates.items()))
     other = next((n for n, r in rates.items() if abs(r - rate) > 1e-3 * rate), None)
     if other is not None:
@@ -45,11 +53,20 @@ def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
 
 
 def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
-    """The frames of a recording in order, reduced to a longest side of `side` pixels, with their original (w, h)."""
-    if path.is_file():
-        yield from read_reduced_video(path, side)
-        return
-    for file in list_photos(path):
+    """The frames of a recording in order, reduced to a longest side of `side` pixels, with their original (w, h).
+
+    Raises InputError for a frame of another size than the first.
+    """
+    size = None
+    for image, full in read_reduced_video(path, side) if path.is_file() else _read_folder(path, side):
+        if full != (size := size or full):
+            raise InputError(f"{path}: has frames of {size[0]}x{size[1]} and of {full[0]}x{full[1]} pixels; a camera's "
+                             "frames have one size")  # fmt: skip
+        yield image, full
+
+
+def _read_folder(folder: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
+    for file in list_photos(folder):
         image = read_8_bit(file)
         yield limit_size(image, side), (image.shape[1], image.shape[0])
 

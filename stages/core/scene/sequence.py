@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from stages.core.scene.schema import number, quote, whole
 
 MAX_FRAMES = 10**6
+RATES = 1e-3, 1e6  # lowest and highest [frames/s]
 
 
 @dataclass(frozen=True)
@@ -30,5 +31,5 @@ def read_sequence_json(value: object) -> FilmedSequence | None:
         raise ValueError("sequence is not a JSON object with starts")
     starts = {quote(name, 255): number(start, f"the start of {quote(name, 40)}", -MAX_FRAMES, MAX_FRAMES)
               for name, start in value["starts"].items()}  # fmt: skip
-    fps, frames = number(value["fps"], "fps of sequence", 1e-3, 1e6), value["frames"]
+    fps, frames = number(value["fps"], "fps of sequence", *RATES), value["frames"]
     return FilmedSequence(fps, whole(frames, "frames of sequence", 1, MAX_FRAMES), starts)

@@ -218,8 +218,6 @@ def timing(world: Scene, scene: Path, recordings: dict[str, Path], frames: int) 
         must_exist(path, "a video")
     rate, known = common_frame_rate(recordings, 0.0), world.sequence
     film = next(iter(recordings.values()))
-    if rate <= 0:
-        raise InputError(f"{film}: does not say how many frames it has in a second; encode it again with a frame rate")
     if known is None:
         return FilmedSequence(rate, frames or MAX_FRAMES, dict.fromkeys(recordings, 0.0))
     if abs(rate - known.fps) > 1e-3 * known.fps:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.scene import recordings
 from stages.core.scene.images import VideoWriter, reduce_frame, write_png
 from stages.core.scene.recordings import common_frame_rate, limit_size, list_recordings, read_recording
 
@@ -62,6 +63,23 @@ def test_frames_are_read_in_order_at_limited_size(tmp_path):
     write_film(tmp_path / "b.mp4", frames=3)
     frames = list(read_recording(tmp_path / "b.mp4", 16))
     assert [(tuple(image.shape), full) for image, full in frames] == [((12, 16, 3), (32, 24))] * 3
+
+
+def test_frames_of_other_sizes_are_refused(tmp_path):
+    folder = write_frames(tmp_path / "a", 0.2)
+    write_png(folder / "1.png", torch.zeros(20, 32, 3))
+    with pytest.raises(InputError, match="a: has frames of 32x24 and of 32x20 pixels; a camera's frames have one size"):
+        list(read_recording(folder, 16))
+
+
+@pytest.mark.parametrize(
+    ("rate", "message"), [(0.0, "does not say how many"), (1e7, "has 1e.07"), (1e-4, "has 0.0001")]
+)
+def test_rates_that_no_camera_has_are_refused(tmp_path, monkeypatch, rate, message):
+    monkeypatch.setattr(recordings, "video_info", lambda path: (2, rate))
+    (tmp_path / "a.mp4").touch()
+    with pytest.raises(InputError, match=f"a.mp4: {message} .*frames .*a second; encode it again"):
+        common_frame_rate({"a.mp4": tmp_path / "a.mp4"}, 50.0)
 
 
 def test_limited_images_are_means_of_areas():

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import torch
 
+from stages.core.errors import InputError
 from stages.core.scene.files import replacing, save_tensors
 
 log = logging.getLogger(__name__)
@@ -61,7 +62,10 @@ class StepCache:
         if path.exists():
             log.info("%s: result of the interrupted run", name)
             torch.serialization.add_safe_globals(list(types))
-            return torch.load(path, weights_only=True)
+            try:
+                return torch.load(path, weights_only=True)
+            except Exception as error:  # a damaged pickle raises anything
+                raise InputError(f"{path}: is damaged; start again without --resume") from error
         with self.timed(name):
             made = make()
         save_tensors(path, made)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from stages.core.errors import InputError
 from stages.reconstruct.depth import DepthMap
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import _cache_key
@@ -56,7 +57,7 @@ def test_failed_step_leaves_no_file(tmp_path):
 def test_cached_pickles_cannot_run_code(tmp_path):
     steps = StepCache(tmp_path / "steps")
     (steps.folder / "model.pt").write_bytes(pickle.dumps(print, protocol=2))
-    with pytest.raises(pickle.UnpicklingError):
+    with pytest.raises(InputError, match="model.pt: is damaged; start again without --resume"):
         steps.cached("model", lambda: 1)
 
 

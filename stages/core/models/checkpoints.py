@@ -17,6 +17,7 @@ from torch import Tensor
 from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
+from stages.core.models.torch_files import dense_tensors, read_checkpoint
 from stages.core.scene.files import must_exist, replacing, sha256
 from stages.core.scene.schema import number, quote, read_json, reason, whole
 
@@ -108,14 +109,20 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
     card = read_card(path, MODELS)
     state = read_state(path, card)
     try:
-        _check_config(card["config"])
-        with torch.device("meta"):  # shapes first: they may need any amount of memory
-            build(card["model"], **card["config"]).load_state_dict(state, assign=True)
-        model = build(card["model"], **card["config"])
-        model.load_state_dict(state)
+        model = _filled(card["model"], card["config"], state)
     except (TypeError, RuntimeError, ValueError) as error:
         raise unfit(path, f"the model {card['model']!r} of its card", error) from error
     return model.to(device).eval(), card
+
+
+def _filled(name: str, config: Mapping, state: Mapping[str, Tensor]) -> Dynamics:
+    """The model with these weights. Raises TypeError, RuntimeError or ValueError where they do not fit."""
+    _check_config(config)
+    with torch.device("meta"):  # shapes first: they may need any amount of memory
+        build(name, **config).load_state_dict(state, assign=True)
+    model = build(name, **config)
+    model.load_state_dict(state)
+    return model
 
 
 def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
@@ -124,7 +131,7 @@ def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
         raise InputError(f"{path}: does not have the sha256 that {path.with_suffix('.json').name} states; the file is "
                          "damaged or of another training; fetch or train both again")  # fmt: skip
     try:
-        state = load_file(path)
+        state = dense_tensors(path, load_file(path))
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{path}: is not a safetensors file ({reason(error)}); fetch or train it again") from error
     _check_finite(path, state)
@@ -163,29 +170,24 @@ def read_card(path: Path, models: Collection[str]) -> dict:
 
 def _public(path: Path) -> Dynamics:
     """A model from a checkpoint of the public code; sizes are inferred from the tensor shapes."""
-    try:
-        data = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged pickle raises anything
-        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint ({_line(error)})") from error
-    state = _tensors(data)
+    state = _tensors(path, read_checkpoint(path))
     _check_finite(path, state)
     try:
-        hidden = len(state["predictor.state_embedding.0.weight"])
+        hidden = state["predictor.state_embedding.0.weight"].shape[0]
         layers = sum(k.startswith("predictor.pointnet.extraction_blocks.") and k.endswith("0.weight") for k in state)
         deform = any(k.startswith("predictor.stress_net.") for k in state)
-        model = build("ngff-paper", hidden=hidden, layers=layers, deform=deform)
-        model.load_state_dict(state)
-    except (KeyError, RuntimeError) as error:
+        return _filled("ngff-paper", {"hidden": hidden, "layers": layers, "deform": deform}, state)
+    except (KeyError, IndexError, RuntimeError, ValueError) as error:
         raise unfit(path, "the published NGFF model", error) from error
-    return model
 
 
-def _tensors(data: object) -> dict[str, Tensor]:
-    """The state dict in a checkpoint, without the prefix of data-parallel training."""
-    while isinstance(data, dict) and not any(isinstance(v, Tensor) for v in data.values()):
-        data = next((data[k] for k in ("model_state_dict", "state_dict", "model") if k in data), None)
-    items = data.items() if isinstance(data, dict) else ()
-    return {k.removeprefix("module."): v for k, v in items if isinstance(k, str) and isinstance(v, Tensor)}
+def _tensors(path: Path, data: object) -> dict[str, Tensor]:
+    """The state dict in a checkpoint, up to three levels down, without the prefix of data-parallel training."""
+    for _ in range(3):
+        if isinstance(data, dict) and not any(isinstance(v, Tensor) for v in data.values()):
+            data = next((data[k] for k in ("model_state_dict", "state_dict", "model") if k in data), None)
+    state = dense_tensors(path, data if isinstance(data, dict) else {})
+    return {k.removeprefix("module."): v for k, v in state.items()}
 
 
 def unfit(path: Path, what: str, error: Exception) -> InputError:

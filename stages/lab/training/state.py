@@ -139,12 +139,18 @@ class TrainingState:
         try:
             state = torch.load(path, map_location=self.gradient_norm.device, weights_only=True)
             different = [k for k in key if state["key"].get(k) != key[k]]
-        except Exception as error:  # a damaged pickle raises anything
-            why = " ".join(str(error).split())[:200]
-            raise InputError(f"{path}: cannot be read as a checkpoint ({why})") from error
+            if not different:
+                self._take(state)
+        except torch.cuda.OutOfMemoryError:  # not the file's fault
+            raise
+        except Exception as error:  # a damaged pickle raises anything, and so do values of other types
+            raise InputError(f"{path}: cannot be read as a checkpoint of a training; start anew") from error
         if different:
             raise InputError(f"{path}: was made with another {', '.join(different)}; go on with the same, or start "
                              "anew")  # fmt: skip
+
+    def _take(self, state: dict) -> None:
+        """Go on from what `save` wrote."""
         self.model.load_state_dict(state["model"])
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -2,12 +2,15 @@
 
 import json
 import math
+import struct
+import zipfile
 
 import pytest
 import torch
 
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MODELS, build, find, halve, load, save
+from stages.core.scene.files import sha256
 from tests.core.models.dynamics_fixtures import SMALL_CONFIGS, overlapping_objects
 
 
@@ -125,6 +128,53 @@ def test_unrelated_checkpoint_is_refused(tmp_path, content):
         torch.save(content, file)
     with pytest.raises(InputError, match="c.pth: (cannot be read|does not fit)"):
         load(file)
+
+
+EMBEDDING = "predictor.state_embedding.0.weight"
+BLOCKS = {f"predictor.pointnet.extraction_blocks.{i}.0.weight": torch.zeros(1) for i in range(5000)}
+LOOP: dict = {}
+LOOP["model"] = LOOP
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (LOOP, "does not fit the published NGFF model"), ({EMBEDDING: torch.tensor(1.0)}, "does not fit"),
+    ({EMBEDDING: torch.zeros(1).expand(10**9)}, ".*0.weight is not a dense tensor"),
+    ({EMBEDDING: torch.zeros(8, 3, device="meta")}, ".*0.weight is not a dense tensor"),
+    ({EMBEDDING: torch.zeros(8, 3).to_sparse()}, ".*0.weight is not a dense tensor"),
+    ({EMBEDDING: torch.zeros(10**5)}, "does not fit .*hidden is 100000, not"),
+    ({EMBEDDING: torch.zeros(8, 3), **BLOCKS}, "does not fit .*layers is 5000, not"),
+], ids=["loop", "number", "expanded", "meta", "sparse", "wide", "deep"])  # fmt: skip
+def test_checkpoints_that_would_take_any_time_or_memory_are_refused(tmp_path, content, message):
+    torch.save(content, tmp_path / "c.pth")
+    with pytest.raises(InputError, match=f"c.pth: {message}"):
+        load(tmp_path / "c.pth")
+
+
+def test_checkpoints_with_code_and_compressed_ones_are_refused(tmp_path):
+    torch.save({EMBEDDING: print}, tmp_path / "code.pth")
+    torch.save({EMBEDDING: torch.zeros(1 << 16)}, tmp_path / "a.pth")
+    with zipfile.ZipFile(tmp_path / "a.pth") as plain, \
+            zipfile.ZipFile(tmp_path / "bomb.pth", "w", zipfile.ZIP_DEFLATED) as bomb:  # fmt: skip
+        for name in plain.namelist():
+            bomb.writestr(name, plain.read(name))
+    for name in ("code.pth", "bomb.pth"):
+        with pytest.raises(InputError, match=f"{name}: cannot be read .* damaged or holds other things than tensors"):
+            load(tmp_path / name)
+
+
+@pytest.mark.skipif(not hasattr(torch, "float4_e2m1fn_x2"), reason="a PyTorch without floats of 4 bits")
+def test_floats_of_four_bits_are_refused(saved):
+    data = saved.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    table = json.loads(data[8 : 8 + size])
+    length = len(data) - 8 - size
+    table["more"] = {"dtype": "F4", "shape": [16], "data_offsets": [length, length + 8]}
+    header = json.dumps(table).encode()
+    saved.write_bytes(struct.pack("<Q", len(header)) + header + data[8 + size :] + bytes(8))
+    card = json.loads(saved.with_suffix(".json").read_text())
+    saved.with_suffix(".json").write_text(json.dumps({**card, "sha256": sha256(saved)}))
+    with pytest.raises(InputError, match="w.safetensors: more is not a dense tensor of numbers"):
+        load(saved)
 
 
 def test_weight_search_order(saved, monkeypatch, tmp_path):

@@ -242,6 +242,10 @@ def test_other_checkpoints_are_rejected(data, tmp_path):
         file.attrs["note"] = "made again"
     with pytest.raises(InputError, match="another data"):
         run("gcn", other, out, replace(QUICK, steps=2), resume=True)
+    state = torch.load(out.with_suffix(".ckpt"), weights_only=True)
+    torch.save({k: v for k, v in state.items() if k != "optimizer"}, out.with_suffix(".ckpt"))
+    with pytest.raises(InputError, match="a.ckpt: cannot be read as a checkpoint of a training"):
+        run("gcn", data, out, replace(QUICK, steps=2), resume=True)
     out.with_suffix(".ckpt").write_bytes(b"broken")
     with pytest.raises(InputError, match="checkpoint"):
         run("gcn", data, out, QUICK, resume=True)

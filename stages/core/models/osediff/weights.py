@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from stages.core.errors import InputError
 from stages.core.models.hub import HubSource, folders
 from stages.core.models.pi3.weights import differences
 from stages.core.models.stable_diffusion import read_parts
+from stages.core.models.torch_files import dense_tensors, read_checkpoint
 
 if TYPE_CHECKING:
     from stages.core.models.osediff.network import OSEDiff
@@ -99,10 +100,7 @@ def signal_level(config: dict) -> float:
 
 def read_lora(path: Path) -> dict:
     """The entries of a file of updates. Raises InputError if it is damaged or lacks some."""
-    try:
-        data = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged pickle raises anything
-        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint; fetch it again") from error
+    data = read_checkpoint(path)
     entries = data if isinstance(data, dict) else {}
     numbers = {f"rank_{network}": lambda x: isinstance(x, int) and 1 <= x <= MAX_RANK for network in ADAPTERS}
     tensors = {f"state_dict_{network}": lambda x: isinstance(x, dict) for network in ADAPTERS}
@@ -120,7 +118,7 @@ def merge_lora(model: nn.Module, lora: dict, network: str, path: Path) -> None:
     A convolution's A has its kernel, and B a kernel of one pixel. Raises InputError for updates that do not fit.
     """
     rank, layers = lora[f"rank_{network}"], dict(model.named_modules())
-    state = {str(k): v for k, v in lora[f"state_dict_{network}"].items() if isinstance(v, Tensor)}
+    state = dense_tensors(path, lora[f"state_dict_{network}"])
     wanted, pairs = {}, []
     if network == "unet":
         wanted = {f"conv_in.base_layer.{k}": v for k, v in model.conv_in.state_dict().items()}

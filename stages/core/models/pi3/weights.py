@@ -16,6 +16,7 @@ from stages.core.models.hub import HubSource, folders
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.splat import Pi3Splat
+from stages.core.models.torch_files import dense_tensors, read_checkpoint
 from stages.core.scene.files import must_exist
 from stages.core.scene.schema import reason
 
@@ -87,16 +88,14 @@ def read_state(path: Path) -> dict[str, Tensor]:
     must_exist(path, "weights (.safetensors or .pth)")
     try:
         if path.suffix == ".safetensors":
-            return load_file(path)
-        data = torch.load(path, map_location="cpu", weights_only=True)
-    except SafetensorError as error:
+            return dense_tensors(path, load_file(path))
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{path}: is not a complete safetensors file ({reason(error)}); fetch it again") from error
-    except Exception as error:  # a damaged pickle raises anything
-        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint; fetch it again") from error
+    data = read_checkpoint(path)
     for key in ("state_dict", "model_state_dict", "model", "module"):
         if isinstance(data, dict) and isinstance(data.get(key), dict):
             data = data[key]
-    return {k: v for k, v in data.items() if isinstance(v, Tensor)} if isinstance(data, dict) else {}
+    return dense_tensors(path, data if isinstance(data, dict) else {})
 
 
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> str:

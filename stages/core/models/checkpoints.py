@@ -134,14 +134,7 @@ def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
         state = dense_tensors(path, load_file(path))
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{path}: is not a safetensors file ({reason(error)}); fetch or train it again") from error
-    _check_finite(path, state)
     return {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
-
-
-def _check_finite(path: Path, state: Mapping[str, Tensor]) -> None:
-    for name, values in state.items():
-        if values.is_floating_point() and not values.float().isfinite().all():  # float() also of 8 bits
-            raise InputError(f"{path}: {quote(name)} has values that are not finite; fetch or train it again")
 
 
 def _check_config(config: Mapping) -> None:
@@ -171,7 +164,6 @@ def read_card(path: Path, models: Collection[str]) -> dict:
 def _public(path: Path) -> Dynamics:
     """A model from a checkpoint of the public code; sizes are inferred from the tensor shapes."""
     state = _tensors(path, read_checkpoint(path))
-    _check_finite(path, state)
     try:
         hidden = state["predictor.state_embedding.0.weight"].shape[0]
         layers = sum(k.startswith("predictor.pointnet.extraction_blocks.") and k.endswith("0.weight") for k in state)

@@ -31,12 +31,14 @@ def read_checkpoint(path: Path) -> object:
 def dense_tensors(path: Path, state: Mapping) -> dict[str, Tensor]:
     """The tensors in a table of a file, by name.
 
-    Raises InputError for one that is not dense, of which one number in the file stands for several, or of a type that
-    PyTorch does not convert.
+    Raises InputError for one that is not dense, of which one number in the file stands for several, of a type that
+    PyTorch does not convert, or with values that are not finite.
     """
     found = {str(k): v for k, v in state.items() if isinstance(v, Tensor)}
     for name, values in found.items():
         dense = values.layout == torch.strided and values.device.type == "cpu" and not values.is_quantized
         if not dense or values.dtype == PACKED or values.nbytes > values.untyped_storage().nbytes():
             raise InputError(f"{path}: {quote(name)} is not a dense tensor of numbers; fetch it again")
+        if values.is_floating_point() and not values.float().isfinite().all():  # float() also of 8 bits
+            raise InputError(f"{path}: {quote(name)} has values that are not finite; fetch or train it again")
     return found

@@ -24,7 +24,7 @@ class Pi3Config:
 
     @classmethod
     def of(cls, shapes: Mapping[str, Tensor]) -> Pi3Config:
-        """Sizes inferred from a state dict (names as in π³). Raises KeyError or IndexError for another model's."""
+        """Sizes inferred from a state dict (names as in π³). For another model's KeyError, IndexError or TypeError."""
 
         def depth(prefix: str) -> int:
             return sum(name.startswith(prefix) and name.endswith(".norm1.weight") for name in shapes)

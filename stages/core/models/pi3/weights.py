@@ -20,6 +20,7 @@ from stages.core.models.torch_files import dense_tensors, read_checkpoint
 from stages.core.scene.files import must_exist
 from stages.core.scene.schema import reason
 
+MAX_DEPTH = 1000  # blocks of a part of the network; each takes time to make
 SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
 
@@ -69,9 +70,12 @@ def load(path: Path, name: str) -> nn.Module:
     state = {k: v.float() if v.is_floating_point() else v for k, v in read_state(path).items()}
     try:
         config = Pi3Config.of({k.removeprefix(source.prefix): v for k, v in state.items()})
-    except (KeyError, IndexError) as error:
+        if max(config.encoder_depth, config.decoder_depth, config.head_depth) > MAX_DEPTH:
+            raise ValueError("a deeper network")
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        what = f"include no {error.args[0]}" if isinstance(error, KeyError) else "are those of another network"
         raise InputError(
-            f"{path}: holds no weights of {name} (its {len(state)} tensors include no {error.args[0]}); "
+            f"{path}: holds no weights of {name} (its {len(state)} tensors {what}); "
             f"those at https://huggingface.co/{source.repository} are meant"
         ) from error
     with torch.device("meta"):
@@ -99,10 +103,11 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
 
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> str:
-    """Message listing missing, unknown and differently shaped tensors; empty if all fit."""
+    """Message listing missing and unknown tensors, and those of another shape or type; empty if all fit."""
     other = [f"{k} {tuple(given[k].shape)} instead of {tuple(wanted[k].shape)}"
              for k in wanted if k in given and given[k].shape != wanted[k].shape]  # fmt: skip
+    unreal = [k for k in wanted if k in given and wanted[k].is_floating_point() > given[k].is_floating_point()]
     groups = {"missing": [k for k in wanted if k not in given], "unknown": [k for k in given if k not in wanted],
-              "of another shape": other}  # fmt: skip
+              "of another shape": other, "that are no real numbers": unreal}  # fmt: skip
     return "; ".join(f"{len(names)} tensors {what}: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
                      for what, names in groups.items() if names)  # fmt: skip

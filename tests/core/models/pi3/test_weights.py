@@ -1,6 +1,7 @@
 """Published weights: search, loading from both file formats, error messages and download."""
 
 import logging
+import math
 import sys
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.models.pi3.download import download
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.splat import Pi3Splat
-from stages.core.models.pi3.weights import find, load
+from stages.core.models.pi3.weights import MAX_DEPTH, find, load
 from stages.core.scene.files import sha256
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 from tests.core.models.pi3.test_splat import TINY_SPLAT
@@ -54,6 +55,26 @@ def test_error_lists_missing_unknown_and_mismatched_tensors(tmp_path):
     assert "2 tensors missing: encoder.norm.bias, point_head.proj.bias" in message
     assert "1 tensors unknown: extra.weight" in message
     assert "conf_head.proj.bias (7,) instead of (196,)" in message
+
+
+@pytest.mark.parametrize(("name", "values", "message"), [
+    ("register_token", torch.zeros(1, 1, 5, 32, dtype=torch.int64), "1 tensors that are no real numbers: regis"),
+    ("register_token", torch.full((1, 1, 5, 32), math.nan), "register_token has values that are not finite"),
+    ("decoder.0.attn.q_norm.weight", torch.zeros(()), "holds no weights of pi3 .*are those of another network"),
+    ("encoder.pos_embed", torch.zeros(1, 0, 4), "holds no weights of pi3 .*are those of another network"),
+    *((f"{part}.{MAX_DEPTH}.norm1.weight", None, "holds no weights of pi3 .*are those of another network")
+      for part in ("encoder.blocks", "decoder", "point_decoder.blocks")),
+])  # fmt: skip
+def test_tensors_that_no_such_network_has(tmp_path, name, values, message):
+    state = Pi3(TINY).state_dict()
+    if values is None:  # deeper than any
+        part, _, rest = name.partition(f".{MAX_DEPTH}")
+        state |= {f"{part}.{i}{rest}": torch.zeros(1) for i in range(MAX_DEPTH + 1)}
+    else:
+        state[name] = values
+    save_file(state, tmp_path / "a.safetensors")
+    with pytest.raises(InputError, match=f"a.safetensors: .*{message}"):
+        load(tmp_path / "a.safetensors", "pi3")
 
 
 def test_other_networks_and_broken_files_are_refused(tmp_path):

@@ -357,6 +357,14 @@ def test_a_message_that_is_too_long_ends_the_connection_before_it_is_read(server
         assert closed.value.rcvd.code == 1009
 
 
+def test_errors_of_the_event_loop_are_no_tracebacks(server, caplog):
+    """Such as those of connections for which this process has no more file descriptors."""
+    server._loop.call_soon_threadsafe(lambda: 1 / 0)
+    with client(server) as good:
+        assert json.loads(good.recv(timeout=LONGEST)) == {"control": True}
+    assert not caplog.records
+
+
 def test_two_hundred_connections_leave_nothing_behind(server):
     before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
 

@@ -1,6 +1,8 @@
 """The loop of a live session against a clock that the test sets: pace, pauses, delays, failures and recordings."""
 
+import errno
 import json
+import os
 import struct
 from contextlib import ExitStack
 from dataclasses import replace
@@ -159,6 +161,21 @@ def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):
     whole = read_trajectory(played.out)
     assert len(whole) == played.header["frames"] and whole.info.forces[0]["what"] == "pinned"
     torch.testing.assert_close(whole.positions[-1], played.sent[-1][1])
+
+
+def test_a_copy_that_cannot_be_written_is_noted_and_the_session_goes_on(play, monkeypatch):
+    def full(source, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    played = play()
+    monkeypatch.setattr(loop.shutil, "copyfile", full)
+    played.go_on(0.1, {"do": "save"})
+    assert played.header["note"].endswith("traj-1.h5: cannot be written (No space left on device)")
+    assert [p.name for p in played.out.parent.iterdir()] == [played.writer.part.name]
+    monkeypatch.undo()
+    assert played.live.writer.frames > 1
+    played.files.close()
+    assert len(read_trajectory(played.out)) == played.header["frames"]
 
 
 def test_the_recording_is_on_the_disk_within_a_second(play):

@@ -151,12 +151,20 @@ class _Live:
         self.show()
 
     def save(self) -> None:
-        """A copy of the recording so far, beside the file that is written at the end: traj-1.h5, traj-2.h5, ..."""
+        """A copy of the recording so far, beside the file that is written at the end: traj-1.h5, traj-2.h5, ...
+
+        Where it cannot be written, as on a full disk, a note says so and the session goes on.
+        """
         numbered = (self.out.with_name(f"{self.out.stem}-{i}{self.out.suffix}") for i in itertools.count(1))
         path = next(p for p in numbered if not p.exists())
         self.writer.store_prompts(self.session.record)
-        with replacing(path) as part:
-            shutil.copyfile(self.writer.part, part)
+        try:
+            with replacing(path) as part:
+                shutil.copyfile(self.writer.part, part)
+        except InputError as error:
+            log.warning("%s", error)
+            self.note = str(error)
+            return
         self.note = f"{path.name}: {self.writer.frames} frames"
         log.info("saved %s", self.note)
 

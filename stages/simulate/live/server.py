@@ -23,6 +23,7 @@ from http import HTTPStatus
 from stages.core.errors import InputError, MissingPackage
 from stages.simulate.live.messages import MAX_BYTES, BadMessage, parse_message
 
+log = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MAX_CLIENTS = 16
 MAX_ERRORS = 10  # wrong messages after which a client is disconnected
@@ -63,6 +64,8 @@ class LiveServer:
         self._frame, self._number = b"", -1
         self._arrived = threading.Event()
         self._loop = asyncio.new_event_loop()
+        # more connections than this process may have files open are tracebacks of asyncio else; they are accepted later
+        self._loop.set_exception_handler(lambda _, context: log.debug("%s", context["message"]))
         self._thread = threading.Thread(target=self._run, name="live server", daemon=True)
 
     def __enter__(self) -> LiveServer:

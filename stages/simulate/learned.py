@@ -23,6 +23,7 @@ from stages.core.models.initial_conditions import FLOOR, InitialConditions, cent
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.materials import MODELS
+from stages.core.physics.rigid_shapes import standing_shapes
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
 from stages.core.scene.field_start import FieldStart, FieldUnits
@@ -84,9 +85,9 @@ def rollout(
     setup.warn_of_lifted(scene)
     ids = [o.id for o in scene.objects]
     per_object = [keypoints.rest[keypoints.object_id == i] for i in ids]
-    solids = [replace(s, centre=s.centre + shift, inertia=s.inertia + inertia) for s, (shift, inertia)
-              in zip(solid_bodies(scene, setup.bodies.spacing, device), map(setup.uneven_moments, range(len(ids))),
-                     strict=True)]  # fmt: skip
+    uneven = map(setup.uneven_moments, range(len(ids)))
+    solids = [replace(s, centre=s.centre + shift, inertia=s.inertia + inertia)
+              for s, (shift, inertia) in zip(_solids(scene, setup, options, device), uneven, strict=True)]  # fmt: skip
     density = torch.tensor([setup.materials[i].material.density for i in ids])
     masses = density * (torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3)
     units = ModelUnits.for_objects(per_object, masses, setup.box.low[2], scene.metres_per_unit, options.gravity)
@@ -153,6 +154,14 @@ def rollout(
                 rest.advance(stepper, steps, _rows(held, ids))
 
     return states()
+
+
+def _solids(scene: Scene, setup: SceneSetup, options: SimulateOptions, device: str) -> list[SolidBody]:
+    """The solid bodies of the objects: with solved contacts those of the surfaces that touch."""
+    if options.contact != "solved":
+        return solid_bodies(scene, setup.bodies.spacing, device)
+    shapes = standing_shapes(scene, options.seed, setup.box.low[2])
+    return [SolidBody(shape.volume, shape.com, shape.inertia / shape.volume) for shape, _ in shapes]
 
 
 def _field_start(

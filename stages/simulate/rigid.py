@@ -27,7 +27,7 @@ from stages.core.kernels.threads import parallel_map
 from stages.core.perception.table_outline import TableOutline
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, MaterialChoice
-from stages.core.physics.rigid_shapes import rigid_shapes
+from stages.core.physics.rigid_shapes import standing_shapes
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -103,13 +103,10 @@ def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: Sim
     """The bodies where the scene has them; what lies below the floor is cut off, if most is above it."""
     unit, bodies = scene.metres_per_unit, []
     floor = setup.box.low[2]
-    shapes = rigid_shapes(scene, options.seed, floor)
-    for row, (o, shape) in enumerate(zip(scene.objects, shapes, strict=True)):
+    shapes = standing_shapes(scene, options.seed, floor)
+    for row, (o, (shape, ground)) in enumerate(zip(scene.objects, shapes, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
-        ground, own = floor, scene.gaussians.object_id == o.id
-        if float(scene.gaussians.means[own, 2].median()) < floor:
-            (shape,) = rigid_shapes(replace(scene, gaussians=scene.gaussians[own], objects=(o,)), options.seed)
-            ground = float(shape.hull[:, 2].min())
+        if ground < floor:
             log.info("object %d (%s) is below the floor; it stands at %.3g", o.id, o.name, ground)
         shape = replace(shape, com=shape.com + shift, inertia=shape.inertia + shape.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned

@@ -10,7 +10,7 @@ from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
-from stages.lab.assets.shapes import ellipsoid, to_gaussians
+from stages.lab.assets.shapes import Surface, ellipsoid, to_gaussians
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import measure
@@ -67,3 +67,20 @@ def test_balls_that_overlap_at_the_start_are_not_pushed_apart(device):
     scene = Scene(concatenate(parts), (SceneObject(1, "left"), SceneObject(2, "right")), None, 0.0)
     t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=16, keypoints=64, device=device))
     assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3
+
+
+def test_a_ring_of_random_gaussians_has_its_volume_and_inertia(device):
+    """2 pi^2 R r^2; for each kilogram R^2 + 3/4 r^2 about its axis and R^2 / 2 + 5/8 r^2 across."""
+    R, r = 0.2, 0.06
+    rng = torch.Generator().manual_seed(0)
+    a, b, keep = torch.rand(3, 9000, generator=rng) * torch.tensor([2 * math.pi, 2 * math.pi, R + r])[:, None]
+    a, b = (angle[keep < R + r * b.cos()] for angle in (a, b))  # evenly by area
+    out = torch.stack([a.cos() * b.cos(), a.sin() * b.cos(), b.sin()], 1)
+    points = R * torch.stack([a.cos(), a.sin(), torch.zeros_like(a)], 1) + r * out + torch.tensor([0, 0, 1.0])
+    grey = torch.full((len(points), 3), 0.5)
+    scene = Scene(to_gaussians(Surface(points, out), grey, 1), (SceneObject(1, "ring"),), None, 0.0)
+    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=1, keypoints=64, device=device))
+    assert float(t.field.volume[0]) == pytest.approx(2 * math.pi**2 * R * r**2, rel=0.05)
+    across = R**2 / 2 + 5 / 8 * r**2
+    expected = t.field.units.length**2 * torch.diag(torch.tensor([across, across, R**2 + 3 / 4 * r**2]))
+    torch.testing.assert_close(t.field.inertia[0], expected, rtol=0.03, atol=0.03 * float(expected[0, 0]))

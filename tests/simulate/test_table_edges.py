@@ -12,7 +12,7 @@ import torch
 from stages.core.perception.table_outline import table_outline
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
-from stages.core.physics.rigid_shapes import rigid_shapes
+from stages.core.physics.rigid_shapes import standing_shapes
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
@@ -60,10 +60,10 @@ def test_a_block_that_stops_over_the_edge_is_held_by_it(tmp_path, monkeypatch):
     """Its centre comes to rest .04 before the edge, with two of its four lower corners beyond it."""
 
     def of_corners(*args):
-        sides = ((p, torch.stack(p.hull.aminmax(dim=0), 1)) for p in rigid_shapes(*args))
-        return [replace(p, hull=torch.cartesian_prod(*corners)) for p, corners in sides]
+        sides = ((p, torch.stack(p.hull.aminmax(dim=0), 1), ground) for p, ground in standing_shapes(*args))
+        return [(replace(p, hull=torch.cartesian_prod(*corners)), ground) for p, corners, ground in sides]
 
-    monkeypatch.setattr("stages.simulate.rigid.rigid_shapes", of_corners)
+    monkeypatch.setattr("stages.simulate.rigid.standing_shapes", of_corners)
     speed = math.sqrt(2 * 0.4 * G * (EDGE - 0.04 - 0.2))
     t = roll(tmp_path, block(0.2), velocity=(f"object=1 {speed},0,0",), steps=36)
     assert float(t.com[-1, 0, 0]) == pytest.approx(EDGE - 0.04, abs=0.006)

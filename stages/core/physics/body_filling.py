@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from stages.core.physics.covered_hull import hull_voxels
 from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 
 MIN_PARTICLES = 40  # per object
@@ -21,21 +21,26 @@ LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are c
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 STRAY = 0.01  # fraction of an object's points that may be below it, and of voxels in which others may be
 UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
-SOLID = 0.9  # fraction of its hull that a body without leaks fills at least: voxels are accurate to about 5 %
 FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
 
 
-def closed_body(
-    points: np.ndarray, h: float, gap: float, floor: float | None, others: np.ndarray | None = None,
-    hull: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+class SurfaceCloud(NamedTuple):
+    """Points of an object's surface, and where it may be closed."""
+
+    points: np.ndarray  # (n, 3)
+    gap: float  # between points
+    hole: float  # the widest gap of a closed surface
+    others: np.ndarray | None  # (k, 3) points of other objects, where its unseen sides are missing
+
+
+def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.ndarray, np.ndarray]:
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
     It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
-    no undersides of what is at rest, and only parts of the surface around them. So those with points of `others` (k, 3)
-    are also closed where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are
-    not inside. A body whose surface is its convex `hull` (planes, see `covered_hull`) and which leaks is that hull.
+    no undersides of what is at rest, and only parts of the surface around them. So those with `others` are also closed
+    where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are not inside.
     """
+    points, others = cloud.points, cloud.others
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
     low = cells.min(0) - margin
@@ -47,16 +52,16 @@ def closed_body(
     at = np.ravel_multi_index(tuple(cells.T), shape)
     shell = np.zeros(shape, bool)
     shell.ravel()[at] = True
-    bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    wide, offset = within(shell, bridge), points / h - low - cells - 0.5
+    bridge, widest = (min(max(math.ceil(gap / h / 2), 1), 4) for gap in (cloud.gap, cloud.hole))
+    offset = points / h - low - cells - 0.5
 
-    def filled(bottom: int | None, leaks: Sequence[int], sealed: bool = False) -> np.ndarray:
-        return _trim(_largest(_fill(shell, wide, bridge, bottom, leaks, sealed)), offset, at)
+    def filled(bottom: int | None, leaks: Sequence[int], bridge: int = bridge, sealed: bool = False) -> np.ndarray:
+        return _trim(_largest(_fill(shell, within(shell, bridge), bridge, bottom, leaks, sealed)), offset, at)
 
-    body = filled(None, LEAK_RADII)
+    body = filled(None, LEAK_RADII, widest)
     lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
     if floor is not None:
-        # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide leaks
+        # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide holes
         body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
     most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
     if others is not None and most > FULLER * body.sum():
@@ -68,10 +73,6 @@ def closed_body(
         inside = np.count_nonzero(added[tuple(theirs.T)]) > STRAY * added.sum()
         if other.sum() > FULLER * body.sum() and not inside:
             body = other
-    if hull is not None:
-        inside = hull_voxels(hull, low, h, shape)
-        if body.sum() < SOLID * inside.sum():
-            body |= inside
     thick = opened(body)
     thin = body & ~thick
     fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet

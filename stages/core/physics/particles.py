@@ -12,12 +12,13 @@ are in the unit of the Gaussians.
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
 from stages.core.errors import InputError
@@ -25,8 +26,14 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
-from stages.core.physics.body_filling import MAX_VOXELS_ALONG, MIN_PARTICLES, STRAY, closed_body, thick_skin
-from stages.core.physics.covered_hull import covered_hull
+from stages.core.physics.body_filling import (
+    MAX_VOXELS_ALONG,
+    MIN_PARTICLES,
+    STRAY,
+    SurfaceCloud,
+    closed_body,
+    thick_skin,
+)
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -38,7 +45,9 @@ MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
 START = 0.25  # of the object's bounds in their voxel
 CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
-AROUND = 4  # neighbour whose distance is 1 / sqrt(density) in a square lattice, and 1.09 of that at random
+AROUND = 4  # neighbours at the same distance in a square lattice
+MEDIAN_AROUND = gammaincinv(AROUND, 0.5)  # of pi density distance^2 to the fourth neighbour at random
+RANDOM = (math.log(2) / MEDIAN_AROUND) ** 0.5  # ratio of the median distances to the first and the fourth at random
 ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
 BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
 
@@ -51,15 +60,6 @@ class Bodies:
     body: Int[Tensor, "p"]  # index into scene.objects
     volume: Float[Tensor, "p"]
     spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
-
-
-class SurfaceCloud(NamedTuple):
-    """Points of an object's surface, and where it may be closed."""
-
-    points: np.ndarray  # (n, 3)
-    gap: float  # between points, which is closed
-    hull: np.ndarray | None  # planes (f, 4) of the convex hull, where that is the surface
-    others: np.ndarray | None  # (k, 3) points of other objects, where its unseen sides are missing
 
 
 @cached_in_scene
@@ -75,7 +75,7 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     clouds = [SurfaceCloud(*row, _others(scene, o.id)) for row, o in zip(found, scene.objects, strict=True)]
     extent = max(float((c.points.max(0) - c.points.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
-    finest = max(extent / MAX_VOXELS_ALONG, max(c.gap for c in clouds) / 8, 1e-4 * scene_size(scene), 1e-9)
+    finest = max(extent / MAX_VOXELS_ALONG, max(c.hole for c in clouds) / 8, 1e-4 * scene_size(scene), 1e-9)
     h, ratio = max(extent / 40, finest), 1.0
     for _ in range(5):
         h = max(h * min(max(ratio, 0.1), 10) ** 0.4, finest)  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
@@ -171,15 +171,14 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     lower bounds are within the first ones, so that rounding does not decide in which voxels flat sides are. Raises
     InputError for an object without any usable Gaussian.
     """
-    points, gap, hull = _cloud(scene, object_id, seed)
+    points, gap, hole = _cloud(scene, object_id, seed)
     spacing = _usable_spacing(scene, object_id)
-    h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
+    h = max(float((points.max(0) - points.min(0)).max()) / along, hole / 8, spacing / 3, 1e-9)
     first = points.min(0) + (0.5 - START) * h  # centre of the first voxel
     origin = first - h / 2
     floor = scene.floor - origin[2] if _stands(points, h, scene.floor) else None
-    if hull is not None:
-        hull = np.column_stack([hull[:, :3], hull[:, 3] + hull[:, :3] @ origin])
-    body, low = closed_body(points - origin, h, gap, floor, _others(scene, object_id, origin), hull)
+    cloud = SurfaceCloud(points - origin, gap, hole, _others(scene, object_id, origin))
+    body, low = closed_body(cloud, h, floor)
     return torch.from_numpy(first + (np.argwhere(body) + low) * h), h
 
 
@@ -189,7 +188,7 @@ def _solid(scene: Scene, cloud: SurfaceCloud, h: float, skin: bool) -> tuple[np.
     it stood when photographed.
     """
     stands = _stands(cloud.points, h, scene.floor)
-    body, low = closed_body(cloud.points, h, cloud.gap, scene.floor if stands else None, cloud.others, cloud.hull)
+    body, low = closed_body(cloud, h, scene.floor if stands else None)
     photographed = scene.cameras is not None  # so the objects were at rest
     extended = photographed and stands and _topples(body)
     if extended:
@@ -222,12 +221,11 @@ def _topples(body: np.ndarray) -> bool:
 
 
 @cached_in_scene
-def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float, np.ndarray | None]:
-    """`surface_points` of an object, the gap between them that is closed, and its `covered_hull`."""
-    points, means = surface_points(scene, object_id, seed), usable_means(scene, object_id).double()
-    around = _spacing(means, AROUND)
-    hull = covered_hull(means[inliers(means)].numpy(), around) if around else None
-    return points, max(_gap(points), CLOSED * _usable_spacing(scene, object_id)), hull
+def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float, float]:
+    """`surface_points` of an object, the gap between them, and the widest one that a closed surface has."""
+    points = surface_points(scene, object_id, seed)
+    gap = max(_gap(points), CLOSED * _usable_spacing(scene, object_id))
+    return points, gap, max(gap, largest_hole(usable_means(scene, object_id).double()))
 
 
 @cached_in_scene
@@ -243,6 +241,22 @@ def _spacing(means: Float[Tensor, "n 3"], neighbour: int = 1) -> float:
     some = means[:: max(1, len(means) // 2000)]
     _, index = knn(means, some, neighbour + 1)
     return float((some - means[index[:, -1]]).norm(dim=1).median())
+
+
+def largest_hole(means: Float[Tensor, "n 3"]) -> float:
+    """Width of the largest hole between Gaussians that lie evenly or at random on a closed surface.
+
+    Holes between points at random are much wider than those of a lattice with as many, and some are found on any
+    surface: of the 2 n circles through three of n points that have no other inside, a share (1 + x) exp(-x) is larger
+    than x / pi of the area per point (Miles 1970, "On the homogeneous planar Poisson point process"). Between a lattice
+    and this, widths are interpolated by the ratio of the distances to the nearest and the fourth neighbour.
+    """
+    near, around = _spacing(means), _spacing(means, AROUND)
+    if not around:  # few, or more than AROUND in one place
+        return CLOSED * near
+    even = np.clip((near / around - RANDOM) / (1 - RANDOM), 0.0, 1.0)
+    at_random = 2 * math.sqrt(float(gammainccinv(2, 0.5 / len(means))) / MEDIAN_AROUND)
+    return float(even * CLOSED + (1 - even) * at_random) * around
 
 
 def _gap(points: np.ndarray) -> float:

@@ -6,7 +6,7 @@ rest have those of their filled voxels. Lengths are in the unit of the Gaussians
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,6 +65,21 @@ def rigid_shapes(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[R
         return _shape(solids[row], seed) if ball is None else _ball_shape(ball)
 
     return parallel_map(shape, range(len(solids)))
+
+
+@cached_in_scene
+def standing_shapes(scene: Scene, seed: int, floor: float) -> list[tuple[RigidShape, float]]:
+    """The shape of each object above what it stands on, as `rigid_shapes`, and the height of that.
+
+    It is the floor, except for an object of which more than half is below: that stands on something else.
+    """
+    out = [(shape, floor) for shape in rigid_shapes(scene, seed, floor)]
+    for row, o in enumerate(scene.objects):
+        own = scene.gaussians.object_id == o.id
+        if float(scene.gaussians.means[own, 2].median()) < floor:
+            (shape,) = rigid_shapes(replace(scene, gaussians=scene.gaussians[own], objects=(o,)), seed)
+            out[row] = shape, float(shape.hull[:, 2].min())
+    return out
 
 
 @cached_in_scene

@@ -4,7 +4,7 @@ Units are those of the scene's own scales, so that no constant of the solver dep
 object's longest side, the median mass, and SUBSTEPS substeps.
 
 Contacts rebound and have exact Coulomb friction (`contact_forces.py`); that of a pair is the larger coefficient, as in
-the other engines. Round bodies are balls, which a loss of energy in the contact slows down as they roll.
+the other engines. Round bodies are balls or cylinders, which a loss of energy in the contact slows down as they roll.
 Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
 (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
 is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.

@@ -46,15 +46,26 @@ class Body:
     pinned: bool
     ground: float  # height of the plane under it [m]
 
-    def rolling_arm(self, radius: float, gravity: float) -> float:
-        """Moment that resists rolling on a rigid plane, of a ball of this radius [m] under its weight, per weight [m].
+    def rolling_arm(self, gravity: float) -> float:
+        """Moment that resists rolling on a rigid plane, of a ball or cylinder under its weight, per weight [m].
 
-        3/16 of the radius of contact and of the fraction of the energy that a cycle of compression loses: Johnson 1985,
-        "Contact mechanics", section 9.4, with the radius of contact by Hertz. `gravity` in m/s^2.
+        3/16 of the radius of contact of a ball, or 2 / (3 pi) of half its width of a cylinder, times the fraction of
+        the energy that a cycle of compression loses: Johnson 1985, "Contact mechanics", section 9.4, with contacts by
+        Hertz. `gravity` in m/s^2.
         """
-        m = self.material
-        contact = (0.75 * self.mass * abs(gravity) * radius * (1 - m.nu**2) / m.E) ** (1 / 3)
-        return 3 / 16 * contact * (1 - math.exp(-math.pi * m.loss))
+        m, weight = self.material, self.mass * abs(gravity)
+        yielding = (1 - m.nu**2) / m.E
+        if self.shape.ball is not None:
+            contact = 3 / 16 * (0.75 * weight * self.unit * self.shape.ball.radius * yielding) ** (1 / 3)
+        else:
+            radius, length = self.shape.cylinder.radius, self.shape.cylinder.height
+            contact = 2 / (3 * math.pi) * (4 / math.pi * weight * radius / length * yielding) ** (1 / 2)
+        return contact * (1 - math.exp(-math.pi * m.loss))
+
+    @property
+    def unit(self) -> float:
+        """Metres in a scene unit."""
+        return float(self.mass / (self.material.density * self.shape.volume)) ** (1 / 3)
 
 
 def restitution(loss: float) -> float:
@@ -110,21 +121,27 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
 def _add_body(spec, name: str, b: Body, units: Units, gravity: float) -> None:
     import mujoco  # noqa: PLC0415 -- slow to import
 
-    unit = float(b.mass / (b.material.density * b.shape.volume)) ** (1 / 3)  # metres in a scene unit
+    scale = b.unit / units.length
     body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
     body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
-    inertia = b.shape.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
+    inertia = b.shape.inertia.double() * b.mass / b.shape.volume * scale**2 / units.mass
     body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     if not b.pinned:
         body.add_freejoint()
-    ball = b.shape.ball
-    if ball is not None:  # a polyhedron loses energy where it rolls over its edges
-        arm = b.rolling_arm(ball.radius * unit, gravity * units.length / units.time**2)
-        at = (ball.centre - b.shape.com.double().numpy()) * unit / units.length
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[ball.radius * unit / units.length, 0, 0], pos=at,
-                      condim=6, friction=[b.friction, 0, arm / units.length], solimp=SOLIMP)  # fmt: skip
+    ball, cylinder = b.shape.ball, b.shape.cylinder
+    solid = ball or cylinder
+    if solid is not None:  # a polyhedron loses energy where it rolls over its edges
+        arm = b.rolling_arm(gravity * units.length / units.time**2) / units.length
+        at = (solid.centre - b.shape.com.double().numpy()) * scale
+        quat, size = np.array([1.0, 0.0, 0.0, 0.0]), [solid.radius * scale, 0, 0]
+        if cylinder is not None:
+            mujoco.mju_quatZ2Vec(quat, cylinder.axis)
+            size[1] = cylinder.height / 2 * scale
+        kind = mujoco.mjtGeom.mjGEOM_SPHERE if ball is not None else mujoco.mjtGeom.mjGEOM_CYLINDER
+        body.add_geom(type=kind, size=size, pos=at, quat=quat, condim=6, friction=[b.friction, 0, arm],
+                      solimp=SOLIMP)  # fmt: skip
         return
-    vertices = (b.shape.hull - b.shape.com).double() * unit / units.length
+    vertices = (b.shape.hull - b.shape.com).double() * scale
     mesh = spec.add_mesh(name=name, uservert=vertices.flatten().tolist())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],

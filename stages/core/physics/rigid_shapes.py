@@ -1,7 +1,7 @@
 """Each object as a rigid body: its convex hull, and the volume, centre of mass and inertia of what it fills.
 
-A round object is a ball (`ball_fit.py`). Of the others, one that fills its convex hull has the moments of that, the
-rest have those of their filled voxels. Lengths are in the unit of the Gaussians.
+A round object is a ball (`ball_fit.py`) or a cylinder (`cylinder_fit.py`). Of the others, one that fills its convex
+hull has the moments of that, the rest have those of their filled voxels. Lengths are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from torch import Tensor
 from stages.core.geometry.extremes import EXTREMES, extreme_rows
 from stages.core.kernels.threads import parallel_map
 from stages.core.physics.ball_fit import DENT, Ball, fitted_ball
+from stages.core.physics.cylinder_fit import Cylinder, fitted_cylinder
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
-MAX_VERTICES = 200  # of a hull: a cylinder or egg is round to 1 %
+MAX_VERTICES = 200  # of a hull: an egg is round to 1 %
 HULL_SUBSET = 2000  # points of which the hull tells that an object does not fill that of all
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
@@ -50,6 +51,7 @@ class RigidShape:
     com: Float[Tensor, "3"]
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
     ball: Ball | None = None  # that a round object is; `hull` has its points in EXTREMES
+    cylinder: Cylinder | None = None  # that it is; `hull` has points of its edges
 
 
 @cached_in_scene
@@ -137,9 +139,18 @@ def _ball_shape(ball: Ball) -> RigidShape:
     return RigidShape(hull, True, volume, centre, 0.4 * volume * ball.radius**2 * torch.eye(3), ball)
 
 
+def _cylinder_shape(cylinder: Cylinder) -> RigidShape:
+    hull, centre, inertia = (
+        torch.from_numpy(x).float() for x in (cylinder.rims(MAX_VERTICES // 2), cylinder.centre, cylinder.inertia)
+    )
+    return RigidShape(hull, True, cylinder.volume, centre, inertia, cylinder=cylinder)
+
+
 def _shape(solid: Solid, seed: int) -> RigidShape:
     filled = _filled_hull(solid, solid.seen)
     if filled is not None:
+        if (cylinder := fitted_cylinder(solid.surface, filled)) is not None:
+            return _cylinder_shape(cylinder)
         return RigidShape(_vertices(filled, seed), True, *_solid_moments(filled))
     hull = _hull(_extreme(solid.surface)) or ConvexHull(_extreme(_corners(solid.voxels, solid.h)))
     return RigidShape(_vertices(hull, seed), False, *solid.moments)

@@ -10,7 +10,8 @@ from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
-from stages.lab.assets.shapes import Surface, ellipsoid, to_gaussians
+from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
+from stages.lab.bench.experiments.bodies import bowl, compound
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import measure
@@ -84,3 +85,30 @@ def test_a_ring_of_random_gaussians_has_its_volume_and_inertia(device):
     across = R**2 / 2 + 5 / 8 * r**2
     expected = t.field.units.length**2 * torch.diag(torch.tensor([across, across, R**2 + 3 / 4 * r**2]))
     torch.testing.assert_close(t.field.inertia[0], expected, rtol=0.03, atol=0.03 * float(expected[0, 0]))
+
+
+WALL = compound(0.012, ((0.5, 0.4, 0.04), (0.0, 0.0, 0.02)), ((0.04, 0.4, 0.36), (-0.23, 0.0, 0.22)))
+
+
+@pytest.mark.parametrize("name", ["wall", "bowl", "plate"])
+def test_nothing_passes_through_a_wall_in_a_step(device, name):
+    """A ball of radius .05 at 60 m/s, .15 in a substep, in an L and in a bowl, to whose bottom it is nearer than to the
+    wall; and one that a push of one frame gives 400 m/s, before a plate.
+    """
+    body, at, push = {
+        "wall": (WALL, (0.1, 0.0, 0.1), {"velocity": ("object=1 -60,0,0",)}),
+        "bowl": (bowl(0.28, 0.3), (0.0, 0.0, 0.08), {"velocity": ("object=1 -60,0,0",)}),
+        "plate": (box((0.04, 0.4, 0.4), 0.01).moved((-0.23, 0.0, 0.2)), (-0.05, 0.0, 0.2),
+                  {"force": (f"object=1 force=-{400 / 0.01 * 540 * 4 / 3 * math.pi * 0.05**3},0,0 from=0 to=0.01",)}),
+    }[name]  # fmt: skip
+    parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1, widest=math.inf)
+             for i, s in enumerate((ellipsoid((0.05,) * 3, 1500).moved(at), body))]  # fmt: skip
+    scene = Scene(concatenate(parts), (SceneObject(1, "ball"), SceneObject(2, "body")), None, 0.0)
+    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=6, dt=0.01, gravity=0.0, pin=("2",),
+                                        keypoints=64, device=device, **push))  # fmt: skip
+    com = t.com[:, 0]
+    if name == "bowl":  # up its wall and out over the rim
+        assert bool((com[com[:, 2] < 0.3] - torch.tensor([0.0, 0.0, 0.3])).norm(dim=1).max() < 0.26)
+        assert float(com[-1, 2]) > 0.5
+    else:
+        assert float(com[:, 0].min()) > -0.21

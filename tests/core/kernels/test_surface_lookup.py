@@ -11,7 +11,7 @@ import warp as wp
 from scipy.optimize import nnls
 from torch import Tensor
 
-from stages.core.kernels.field.surface_lookup import SurfaceArrays, closest_point
+from stages.core.kernels.field.surface_lookup import SurfaceArrays, closest_point, first_inside
 from stages.core.kernels.interop import launch, view, with_arrays
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 
@@ -98,3 +98,34 @@ def test_of_a_torus_on_a_grid(device):
         assert depth(at).abs().max() < 0.1 * spacing
         assert ((x - at).norm(dim=1) - distance).abs().max() < 0.1 * spacing
         assert (torch.nn.functional.normalize(x - at, dim=1) - normals).norm(dim=1).max() < 2 * spacing / tube
+
+
+@wp.kernel(enable_backward=False)
+def _first_inside(s: SurfaceArrays, x: wp.array[wp.vec3], way: wp.array[wp.vec3], outside: float, out: wp.array[float]):
+    i = wp.tid()
+    out[i] = first_inside(s, 0, x[i], way[i], outside)
+
+
+def test_a_way_meets_the_near_side_of_a_wall_of_three_nodes(device):
+    """From both sides, through it or into it; also for a ball, whose centre stays outside. To a node along the way."""
+    spacing, half, outside = 0.02, 0.03, 0.05
+    low, shape = torch.tensor([-0.2, -0.5, -0.5]), (21, 51, 51)
+    depth = half - (low[0] + spacing * torch.arange(shape[0])).abs()[:, None, None].expand(shape).contiguous()
+    body = grid_of(depth, low, spacing, torch.eye(3), torch.zeros(0, 4))
+    surfaces = with_arrays(SurfaceArrays(), vars(BodySurfaces.of([body]).to(device)))
+    generator = torch.Generator().manual_seed(0)
+    side = torch.tensor([-1.0, 1.0]).repeat(100)
+    x = torch.stack([0.15 * side, *(0.4 * torch.rand(2, 200, generator=generator) - 0.2)], 1)
+    u, v, w = torch.rand(3, 200, generator=generator)
+    way = torch.stack([-side * (0.2 + u), 0.4 * v, 0.4 * w], 1)  # at angles of up to 71 degrees
+    for radius in (0.0, outside):
+        found, away = (torch.empty(200, device=device) for _ in range(2))
+        for ways, out in ((way, found), (-way, away)):
+            arrays = [view(a.to(device), wp.vec3) for a in (x, ways)]
+            launch(_first_inside, 200, [surfaces, *arrays, radius, view(out)], device=device)
+        beyond = found.cpu() - (0.15 - half - radius) / way[:, 0].abs()
+        assert float(beyond.min()) > -1e-5 and float((beyond * way.norm(dim=1)).max()) < spacing + 1e-5
+        assert bool((away == 1).all())
+        arrays = [view(a.to(device), wp.vec3) for a in (x, 0.05 * way)]  # too short
+        launch(_first_inside, 200, [surfaces, *arrays, radius, view(found)], device=device)
+        assert bool((found == 1).all())

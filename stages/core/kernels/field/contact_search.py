@@ -4,7 +4,12 @@ Of the samples of a body near another one, or near a plane, those are kept that 
 across its normal, and the deepest: for each of six directions of the normal, in world axes. The others lie within the
 polygon of these and would bear a load that these can bear. A sample counts for less by ten times its gap, so that those
 that touch come before those that only may.
-Source: manifold reduction by extremes: Moravanszky and Terdiman 2004, "Fast contact reduction for dynamics simulation".
+
+Contacts are found before bodies touch, up to the way of a step, and limit the velocity to the gap over the step.
+Samples and balls that would pass through a wall meet it at the first place of their way that is inside.
+Sources: manifold reduction by extremes: Moravanszky and Terdiman 2004, "Fast contact reduction for dynamics
+simulation"; contacts before bodies touch: Stewart and Trinkle 1996, "An implicit time-stepping scheme for rigid body
+dynamics with inelastic collisions and Coulomb friction".
 """
 
 from __future__ import annotations
@@ -13,7 +18,14 @@ import warp as wp
 
 from stages.core.geometry import surface_faces as faces
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
-from stages.core.kernels.field.surface_lookup import SurfaceArrays, beyond_grid, closest_point, depth_at, nearest_node
+from stages.core.kernels.field.surface_lookup import (
+    SurfaceArrays,
+    beyond_grid,
+    closest_point,
+    depth_at,
+    first_inside,
+    nearest_node,
+)
 
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
 EXTREMES = wp.constant(9)  # kept of each: in eight directions, and the deepest
@@ -21,11 +33,14 @@ SLOTS = wp.constant(6 * 9)
 NONE = wp.constant(-1)
 DIAGONAL = wp.constant(0.70710678)
 GAP_WEIGHT = wp.constant(10.0)  # of a gap against the distance along a direction
+AHEAD = wp.constant(9)  # slot of the point of a ball that meets another body in a step; that of the nearest one is 0
+NO_CONTACT = wp.constant(1.0e18)  # gap [m]
 MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the way of a step [m]; a tenth of an object
 # Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
 MIN_FACING = wp.constant(0.3)
 OPPOSED, CURVED, FACES = wp.constant(faces.OPPOSED), wp.constant(faces.CURVED), wp.constant(faces.FACES)
 STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
+THINNEST = wp.constant(2.0)  # a way that may lead through a wall, in nodes of the grid: sheets have three voxels
 NO_DISTANCE = wp.constant(1e-6)  # in radii of a ball, that has no direction
 
 
@@ -104,10 +119,11 @@ def _local(motion: BodyMotion, scene: int, body: int, x: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _relative_velocity(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
-    """Velocity of body a relative to b at x."""
-    own = motion.velocity[scene, a] + wp.cross(motion.spin[scene, a], x - motion.com[scene, a])
-    return own - motion.velocity[scene, b] - wp.cross(motion.spin[scene, b], x - motion.com[scene, b])
+def _way_of_a_step(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
+    """The way of body a at x in a step, in the frame of body b and relative to it [m]."""
+    velocity = motion.velocity[scene, a] + wp.cross(motion.spin[scene, a], x - motion.com[scene, a])
+    velocity -= motion.velocity[scene, b] + wp.cross(motion.spin[scene, b], x - motion.com[scene, b])
+    return motion.step * (wp.transpose(motion.R[scene, b]) * velocity)
 
 
 @wp.func
@@ -120,10 +136,16 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
     out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
     x = _local(motion, scene, b, out.at)
     found = depth_at(s, b, x)
-    way = motion.step * (wp.transpose(R) * _relative_velocity(motion, scene, a, b, out.at))
+    way = _way_of_a_step(motion, scene, a, b, out.at)
     if wp.length(way) > STEP_OF_A_CELL * s.spacing[b]:
+        share = float(1.0)
+        if wp.length(way) > THINNEST * s.spacing[b]:
+            share = first_inside(s, b, x, way, -s.overlap[a, b])
+            way *= share
         later = depth_at(s, b, x + way)
-        if later[3] < 0.0:  # it stays outside, and may pass an edge whose normal would stop it
+        if share < 1.0:  # it meets a wall, which it may have passed at the end
+            x += way
+        if share < 1.0 or later[3] < 0.0:  # else it stays outside, and may pass an edge whose normal would stop it
             later[3] = later[3] - wp.dot(wp.vec3(later[0], later[1], later[2]), way)
             found = later
     out.normal = -(R * wp.vec3(found[0], found[1], found[2]))
@@ -173,6 +195,33 @@ def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) 
     out.at = centre - s.radius[a] * out.normal
     out.gap += s.overlap[a, b]
     out.facing = True
+    return out
+
+
+@wp.func
+def ball_ahead(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> NearPoint:
+    """The point of a ball a that meets body b in a step, where that is not convex: the nearest point may be of another
+    side. The gap is infinite where it meets none, or moves by less than its radius.
+    """
+    out = NearPoint()
+    out.a = a
+    out.b = b
+    out.gap = NO_CONTACT
+    out.facing = True
+    if s.radius[b] > 0.0 or s.hull_faces[b] > 0:
+        return out
+    centre = motion.com[scene, a] + motion.R[scene, a] * s.centre[a]
+    x = _local(motion, scene, b, centre)
+    way = _way_of_a_step(motion, scene, a, b, centre)
+    if wp.length(way) > s.radius[a]:
+        outside = s.radius[a] - s.overlap[a, b]
+        share = first_inside(s, b, x, way, outside)
+        if share < 1.0:
+            found = depth_at(s, b, x + share * way)
+            inward = wp.vec3(found[0], found[1], found[2])
+            out.normal = -(motion.R[scene, b] * inward)
+            out.gap = share * wp.dot(inward, way) - found[3] - outside
+            out.at = centre - s.radius[a] * out.normal
     return out
 
 
@@ -292,7 +341,7 @@ def _keep_extremes(w: CollisionWorld, scene: int, pair: int, k: int):
 
 @wp.func
 def _count_contacts(w: CollisionWorld, scene: int, pair: int):
-    """Empty slots whose sample is in an earlier one of the same side, and count the others; a ball has one contact."""
+    """Empty slots whose sample is in an earlier one of the same side, and count the others; a ball has one or two."""
     a = pair // w.surfaces.near.shape[0]
     b = pair % w.surfaces.near.shape[0]
     count = int(0)
@@ -305,6 +354,8 @@ def _count_contacts(w: CollisionWorld, scene: int, pair: int):
                 touches = gap < w.motion.margin[scene, a]
             elif slot == 0:
                 touches = ball_near(w.surfaces, w.motion, scene, a, b).gap < _margin(w.motion, scene, a, b)
+            elif slot == AHEAD and a != b:
+                touches = ball_ahead(w.surfaces, w.motion, scene, a, b).gap < _margin(w.motion, scene, a, b)
             w.found.row[scene, at] = wp.where(touches, 0, NONE)
         for other in range(slot - slot % EXTREMES, slot):
             if w.found.row[scene, pair * SLOTS + other] == w.found.row[scene, at]:
@@ -354,5 +405,7 @@ def contact_in_slot(w: CollisionWorld, scene: int, pair: int, slot: int) -> Near
     if a == b:
         return plane_near(w.surfaces, w.motion, scene, a, slot // EXTREMES, q)
     if w.surfaces.radius[a] > 0.0:
+        if slot == AHEAD:
+            return ball_ahead(w.surfaces, w.motion, scene, a, b)
         return ball_near(w.surfaces, w.motion, scene, a, b)
     return sample_near(w.surfaces, w.motion, scene, a, b, q)

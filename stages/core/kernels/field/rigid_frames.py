@@ -89,7 +89,9 @@ def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver,
     later = spin_of(momentum + h * bodies.twist[scene, i], inverse, R)
     world.motion.spin[scene, i] = spin
     world.motion.R[scene, i] = R
-    world.motion.margin[scene, i] = MARGIN + h * (wp.length(velocity) + wp.length(spin) * world.surfaces.reach[i])
+    reach = world.surfaces.reach[i]
+    way = h * (wp.length(velocity + h * bodies.acceleration[scene, i]) + wp.length(later) * reach)  # without contact
+    world.motion.margin[scene, i] = wp.max(MARGIN + h * (wp.length(velocity) + wp.length(spin) * reach), way)
     turn = _double_matrix(R)
     solver.inertia.tensor[scene, i] = mass * (turn * _double_matrix(bodies.inertia[scene, i]) * wp.transpose(turn))
     solver.inertia.inverse[scene, i] = turn * _double_matrix(inverse) * wp.transpose(turn) / mass

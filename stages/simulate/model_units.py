@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.geometry.upright_boxes import longest_side
 from stages.core.models.initial_conditions import FLOOR
 from stages.core.physics.forces import Force
 from stages.core.scene.field_start import UnitFactors
@@ -41,7 +42,7 @@ class ModelUnits(UnitFactors):
         `keypoints` of each object and `floor` are in scene units of `unit` metres, `masses` in kg; `gravity` is
         downwards [m/s^2].
         """
-        sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints]).clamp_min(1e-9)
+        sides = torch.tensor([longest_side(p) for p in keypoints]).clamp_min(1e-9)
         scale = TYPICAL_SIZE / (unit * float(sides.double().log().mean().exp()))
         model_gravity = math.copysign(TRAINING_GRAVITY, gravity) if abs(gravity) > 1e-3 else 0.0
         gravity_ratio = model_gravity / gravity if model_gravity else 1.0  # without gravity, time is not scaled for it

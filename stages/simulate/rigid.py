@@ -23,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
+from stages.core.geometry.upright_boxes import longest_side
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.table_outline import TableOutline
 from stages.core.physics.forces import Force, ForcePrompts
@@ -143,7 +144,7 @@ class _World:
         self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
         unit = scene.metres_per_unit
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
-        size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (b.shape.hull for b in bodies))
+        size = unit * min(longest_side(b.shape.hull) for b in bodies)
         floor = unit * setup.box.low[2]
         table = table_of(scene, options)
         fall = max(float(b.start[2]) for b in bodies) - (floor if table is None else unit * table.ground)

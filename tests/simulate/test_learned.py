@@ -151,12 +151,12 @@ def test_units_and_floor_height_do_not_matter(two_balls):
 
 @pytest.mark.parametrize("size", [0.005, 0.3, 50.0])
 def test_scenes_are_brought_to_the_size_mass_and_gravity_of_training(size):
-    cube = size * torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    cube = size * torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     units = ModelUnits.for_objects([cube, 4 * cube], torch.tensor([2.0, 8.0]), 2.0, 1.0, 10.0)
     assert units.length == pytest.approx(TYPICAL_SIZE / (2 * size)) and units.mass == pytest.approx(TYPICAL_MASS / 4)
     assert units.time == pytest.approx((2 * units.length) ** 0.5)  # lengths over gravity
     assert units.force * 10 * 4 == pytest.approx(TYPICAL_MASS * 5 * units.mass * 4 / TYPICAL_MASS)  # weight to weight
-    middle = 1.25 * size  # the mean of all four corners
+    middle = 1.25 * size  # the mean of all corners
     here = units.to_model(torch.tensor([middle, middle + 1, 3.0]))
     torch.testing.assert_close(here, torch.tensor([0.0, units.length, units.length + FLOOR]), atol=1e-4, rtol=1e-4)
 

@@ -20,6 +20,7 @@ pytestmark = [
 @pytest.fixture(autouse=True)
 def gpu_0_is_unused() -> Iterator[None]:
     """PyTorch takes no memory of it in the test."""
+    torch.cuda.init()  # before that there are no statistics
     torch.cuda.reset_peak_memory_stats(0)
     before = torch.cuda.memory_allocated(0)
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -10,14 +12,16 @@ from torch import Tensor
 BATCH = 1 << 14  # matrices at once: cuSOLVER fails for some hundred thousand, with an internal error or invalid value
 PAIRS = np.array([[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])  # the entries of a symmetric matrix
 FULL = np.array([0, 3, 4, 3, 1, 5, 4, 5, 2])  # which of these are those of the full one
+ON_GPU = threading.Lock()  # PyTorch loads cuSOLVER in the first call, and fails where threads make it at once (#90613)
 UNCLEAR = 1e-6  # length of the vectors across rows below which rounding matters [squared size of the matrix]
 
 
 def eigh(matrices: Float[Tensor, "b n n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n n"]]:
     """Eigenvalues in ascending order and eigenvectors in columns, as torch.linalg.eigh, for a batch of any size."""
-    if not matrices.is_cuda or len(matrices) <= BATCH:
+    if not matrices.is_cuda:
         return torch.linalg.eigh(matrices)
-    values, vectors = zip(*(torch.linalg.eigh(part) for part in matrices.split(BATCH)), strict=True)
+    with ON_GPU:
+        values, vectors = zip(*(torch.linalg.eigh(part) for part in matrices.split(BATCH)), strict=True)
     return torch.cat(values), torch.cat(vectors)
 
 

@@ -1,5 +1,8 @@
 """Eigenvectors of many small symmetric matrices, and solutions of systems of equations."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -15,6 +18,23 @@ def test_more_matrices_than_the_solver_takes_at_once(device):
     assert (values.diff(dim=1) >= 0).all()
     torch.testing.assert_close(A @ vectors, vectors * values[:, None], atol=3e-6, rtol=0)
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, device=device).expand_as(A), atol=3e-6, rtol=0)
+
+
+@pytest.mark.gpu
+def test_first_calls_of_threads():
+    """In a new process: PyTorch loads the solver with the first call."""
+    subprocess.run([sys.executable, "-c", """
+import threading, torch
+from stages.core.geometry.symmetric_matrices import eigh
+A, ready, done = torch.eye(3, device="cuda").expand(8, 3, 3), threading.Barrier(8), []
+def work():
+    ready.wait()
+    done.append(eigh(A))
+threads = [threading.Thread(target=work) for _ in range(8)]
+for t in threads: t.start()
+for t in threads: t.join()
+assert len(done) == 8
+"""], check=True)  # fmt: skip
 
 
 @pytest.mark.parametrize("eigenvalues", [

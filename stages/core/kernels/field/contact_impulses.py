@@ -143,11 +143,13 @@ def effective_response(inertia: Inertias, scene: int, body: int, arm: wp.vec3d) 
 
 @wp.func
 def contact_count(c: Contacts, scene: int) -> int:
+    """Number of contacts in a scene."""
     return c.first[scene, c.first.shape[1] - 1]
 
 
 @wp.func
 def has_contacts(c: Contacts, scene: int, pair: int) -> bool:
+    """Whether a pair of bodies has any."""
     return c.first[scene, pair + 1] > c.first[scene, pair]
 
 
@@ -170,6 +172,7 @@ def normal_impulse(c: Contacts, scene: int, i: int, relative: wp.vec3d) -> f64:
 
 @wp.func
 def contact_impulse(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: f64) -> wp.vec3d:
+    """Impulse on body a at this relative velocity [N s]; its tangential part is at most `bound`."""
     n = c.normal[scene, i]
     slip = relative - wp.dot(relative, n) * n
     across = wp.min(ONE / c.R_t[scene, i], bound / wp.max(wp.length(slip), TINY))

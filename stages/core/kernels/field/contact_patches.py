@@ -28,6 +28,7 @@ class Patches:
 
 @wp.func
 def single(x: wp.vec3d) -> wp.vec3:
+    """The vector in single precision."""
     return wp.vec3(float(x[0]), float(x[1]), float(x[2]))
 
 

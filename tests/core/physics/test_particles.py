@@ -84,9 +84,13 @@ def test_the_folds_of_a_cloth_are_not_filled():
     z = folds(q) + torch.where(torch.arange(len(q)) % 2 == 0, 0.005, -0.005)
     points = torch.cat([q, z[:, None]], 1) * shirt.side * shirt.scale
     points[:, 2] -= points[:, 2].min()
-    (lying, h), (flying, _) = (filled_voxels(scene(splats(points), floor=floor), 1, 140) for floor in (0.0, -1.0))
+    volume = 0.558 * 0.01  # area of the outline times thickness
+    scenes = [scene(splats(points), floor=floor) for floor in (0.0, -1.0)]
+    for each in scenes:
+        assert float(sample_bodies(each, 20_000).volume.sum()) == pytest.approx(volume, rel=0.25)
+    (lying, h), (flying, _) = (filled_voxels(each, 1, 140) for each in scenes)
     assert len(lying) == pytest.approx(len(flying), rel=0.01)
-    assert len(flying) * h**3 == pytest.approx(0.558 * 0.01, rel=0.25)  # area of the outline times thickness
+    assert len(flying) * h**3 == pytest.approx(volume, rel=0.25)
 
 
 def test_a_mug_stays_hollow():

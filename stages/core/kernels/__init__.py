@@ -28,7 +28,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | field/normals                 | Warp                        | `normals_and_spacing_reference` in the file          |
 | field/rigid_motion            | Warp                        | `models.field.rigid_body` (drift, pose)              |
 | field/contact_search,         | Warp                        | `tests/core/kernels/contact_reference.py`, and       |
-|   surface_lookup              |                             |   `physics.solid_surface`                            |
+|   near_points, surface_lookup |                             |   `physics.solid_surface`                            |
 | field/contact_solve,          | Warp with C++ and CUDA      | `tests/core/kernels/contact_reference.py`            |
 |   contact_impulses,           |   snippets                  |                                                      |
 |   newton_system               |                             |                                                      |

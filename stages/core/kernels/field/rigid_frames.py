@@ -23,19 +23,10 @@ from stages.core.kernels.field.contact_impulses import (
     effective_response,
 )
 from stages.core.kernels.field.contact_patches import Patches, add_load, single, spread, sum_patch
-from stages.core.kernels.field.contact_search import (
-    MARGIN,
-    NONE,
-    SLOTS,
-    BodyMotion,
-    CollisionWorld,
-    Found,
-    NearPoint,
-    contact_in_slot,
-    search,
-)
+from stages.core.kernels.field.contact_search import NONE, SLOTS, CollisionWorld, Found, contact_in_slot, search
 from stages.core.kernels.field.contact_solve import solve
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
+from stages.core.kernels.field.near_points import MARGIN, BodyMotion, NearPoint
 from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
 from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays
 

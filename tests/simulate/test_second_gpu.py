@@ -45,6 +45,6 @@ def test_motion_is_that_of_the_first_gpu(engine, monkeypatch):
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, step=0.014))
     options = {"engine": engine, "steps": 4, "keypoints": 32, "quality": "draft"}
     with gpu_0_unused():
-        second = roll_out(two_balls_scene(), SimulateOptions(**options, device="cuda:1"))
+        second = roll_out(two_balls_scene(), SimulateOptions(**options, device=pick_device("cuda:1")))
     first = roll_out(two_balls_scene(), SimulateOptions(**options, device="cuda:0"))
     torch.testing.assert_close(second.positions, first.positions, rtol=0, atol=1e-5)

@@ -6,6 +6,13 @@ from collections.abc import Callable
 from functools import wraps
 
 
+class Results(dict):
+    """Results by function and arguments; a copy in another process starts without them."""
+
+    def __reduce__(self) -> tuple:
+        return Results, ()
+
+
 def cached_in_scene(function: Callable) -> Callable:
     """A deterministic function of a scene and of hashable arguments that computes each result once.
 
@@ -15,7 +22,7 @@ def cached_in_scene(function: Callable) -> Callable:
 
     @wraps(function)
     def call(scene, *args, **options):
-        held = scene.__dict__.setdefault("_cached", {})  # apart from the fields, which are frozen
+        held = scene.__dict__.setdefault("_cached", Results())  # apart from the fields, which are frozen
         key = (function, args, tuple(sorted(options.items())))
         if key not in held:
             held[key] = function(scene, *args, **options)

@@ -95,6 +95,16 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
     assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
 
 
+@pytest.mark.slow
+def test_two_processes_simulate_the_same_as_one(slide, device):
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, frames=4, device=device))
+    costs = []
+    for workers in (1, 2):
+        with simulations(problem, workers) as sims:
+            costs.append(sims.costs([sims.start, sims.start + 0.1], 4))
+    assert costs[0] == costs[1]
+
+
 def test_friction_is_found_from_near_and_its_uncertainty_is_small(slide, device):
     """By Levenberg and Marquardt's method alone; the slide shows nothing of the rebound."""
     problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, frames=14))

@@ -2,8 +2,9 @@
 
 Loss and learning rates follow Kerbl et al. 2023, "3D Gaussian Splatting", sec. 5 and its code; the Gaussians start on
 matched surfaces, so a few hundred iterations are enough on a CPU. Sizes are regularised as in Kheradmand et al. 2024,
-"3D Gaussian Splatting as Markov Chain Monte Carlo", sec. 4, against overfitting few photos. Opacities are not: later
-stages segment and move the surfaces, which have to be opaque.
+"3D Gaussian Splatting as Markov Chain Monte Carlo", sec. 4, against overfitting few photos, and each step leaves out a
+random part of the Gaussians (Park et al. 2025, "DropGaussian: Structural Regularization for Sparse-view Gaussian
+Splatting"). Opacities are not regularised: later stages segment and move the surfaces, which have to be opaque.
 The number of iterations is fixed beforehand and independent of time, so a seed gives the same scene again.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -39,6 +41,8 @@ MEANS_DECAY = 0.01  # factor on this rate at the end of the exponential decay
 DEPTH_WEIGHT = 0.1  # of the error in inverse depth [1 / camera distance]
 MIN_DEPTH = 0.1  # rendered depth is clamped to this in the depth term [camera distances]
 SCALE_WEIGHT = 0.01  # of the mean scale [camera distances]
+DROPOUT = 0.1  # share of the Gaussians left out of a step at the end of a fit, linear in time from none
+PHOTOS = 10  # up to which it is that; it is inversely proportional to their number beyond
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ class _Fit:
     steps: Float[Tensor, "1"]  # that were taken
     camera_distance: float  # [scene units]
     gradients: Float[Tensor, "n"]  # sum of the norms of the means' gradients since the last split
+    lots: Float[Tensor, "n"]  # 0..1, random: a step leaves out an interval of them
 
     @classmethod
     def start(cls, gaussians: Gaussians, views: int, camera_distance: float) -> _Fit:
@@ -96,7 +101,7 @@ class _Fit:
         moments = {name: Moments.like(value) for name, value in values.items()}
         rates = {name: torch.full((1,), rate, device=device) for name, rate in LEARNING_RATES.items()}
         steps, gradients = torch.zeros(1, device=device), torch.zeros(len(gaussians), device=device)
-        return cls(values, moments, rates, steps, camera_distance, gradients)
+        return cls(values, moments, rates, steps, camera_distance, gradients, _lots(len(gaussians), device))
 
     def gaussians(self) -> Gaussians:
         """The Gaussians with activations applied, differentiable; the projection normalises the quats."""
@@ -123,6 +128,21 @@ class _Fit:
             self.moments[name].first[fresh] = 0
             self.moments[name].second[fresh] = 0
         self.gradients = torch.zeros(len(index), device=index.device)
+        self.lots = _lots(len(index), index.device)
+
+
+def _lots(count: int, device: torch.device | str) -> Float[Tensor, "n"]:
+    return torch.rand(count, generator=torch.Generator().manual_seed(0)).to(device)
+
+
+class _Draw(NamedTuple):
+    """What is random or scheduled in a step."""
+
+    row: Int[Tensor, "1"]  # of the photo in its group
+    grey: Float[Tensor, "1"]  # of the background
+    means_rate: Float[Tensor, "1"]  # learning rate of the means
+    dropout: Float[Tensor, "1"]  # share of the Gaussians that are left out
+    lot: Float[Tensor, "1"]  # 0..1: where their interval begins
 
 
 @dataclass(frozen=True)
@@ -175,6 +195,7 @@ def fit_gaussians(
     generator = torch.Generator().manual_seed(options.seed)
     splits = [round(time * steps) for time in DENSITY.split_times if steps >= DENSITY.min_iterations]
     rates = [MEANS_RATE * distance * MEANS_DECAY ** (max(step - 1, 0) / steps) for step in range(steps)]
+    dropout, lots = DROPOUT * min(1.0, PHOTOS / len(views)), _lots(steps, "cpu").tolist()
     order: list[int] = []
     first = 0
     with tqdm(total=steps, desc="fitting photos", unit="step", leave=False) as bar:
@@ -182,7 +203,8 @@ def fit_gaussians(
             schedule = []
             for step in range(first, last + 1):
                 order = order or torch.randperm(len(views), generator=generator).tolist()
-                schedule.append((order.pop(), float(torch.rand((), generator=generator)), rates[step]))
+                grey = float(torch.rand((), generator=generator))
+                schedule.append((order.pop(), grey, rates[step], dropout * step / steps, lots[step]))
             kind(fit, targets, schedule).run(bar)
             if last in splits:
                 with small_operations():  # as in `_Fit.gaussians`
@@ -210,18 +232,18 @@ def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
 class _Steps:
     """Consecutive steps of the fit, each on one photo.
 
-    `schedule` holds for each step the view, the grey of the background, and the learning rate of the means.
+    `schedule` holds for each step the view and the numbers of `_Draw` that follow it.
     """
 
-    def __init__(self, fit: _Fit, targets: Sequence[_Targets], schedule: Sequence[tuple[int, float, float]]):
+    def __init__(self, fit: _Fit, targets: Sequence[_Targets], schedule: Sequence[tuple[int | float, ...]]):
         self.fit, self.schedule, self.device = fit, schedule, fit.gradients.device
         place = {view: (group, row) for group in targets for row, view in enumerate(group.rows)}
-        self.places = [place[view] for view, _, _ in schedule]
+        self.places = [place[view] for view, *_ in schedule]
 
     def run(self, bar: tqdm) -> None:
         """Take all steps."""
-        for step, ((group, row), (_, grey, rate)) in enumerate(zip(self.places, self.schedule, strict=True)):
-            loss = _descend(self.fit, group, torch.tensor([row]), torch.tensor([grey]), torch.tensor([rate]))
+        for step, ((group, row), (_, *numbers)) in enumerate(zip(self.places, self.schedule, strict=True)):
+            loss = _descend(self.fit, group, _Draw(*(torch.tensor([x]) for x in (row, *numbers))))
             bar.update()
             if step % 20 == 0:
                 bar.set_postfix(loss=f"{float(loss):.4f}")
@@ -234,8 +256,8 @@ class _CapturedSteps(_Steps):
     def run(self, bar: tqdm) -> None:
         """Take all steps."""
         device = self.device
-        self.rows = torch.tensor([row for _, row in self.places], device=device)
-        self.greys, self.rates = torch.tensor([s[1:] for s in self.schedule], device=device).T.contiguous()
+        rows = torch.tensor([row for _, row in self.places], device=device)
+        self.draws = _Draw(rows, *torch.tensor([s[1:] for s in self.schedule], device=device).T.contiguous())
         self.counter, self.loss = torch.zeros(1, dtype=torch.int64, device=device), torch.zeros((), device=device)
         self.pairs = self._count_pairs()
         self.graphs: dict[tuple[int, int], torch.cuda.CUDAGraph] = {}
@@ -263,31 +285,28 @@ class _CapturedSteps(_Steps):
         self.graphs[group.size] = captured(lambda: self._step(group))
 
     def _step(self, group: _Targets) -> None:
-        row, grey, rate = (x.index_select(0, self.counter) for x in (self.rows, self.greys, self.rates))
-        self.loss.copy_(_descend(self.fit, group, row, grey, rate, self.pairs))
+        draw = _Draw(*(x.index_select(0, self.counter) for x in self.draws))
+        self.loss.copy_(_descend(self.fit, group, draw, self.pairs))
         self.counter += 1
 
 
-def _descend(
-    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"],
-    means_rate: Float[Tensor, "1"], pairs: Capacity | None = None,
-) -> Float[Tensor, ""]:  # fmt: skip
-    """One step on the photo in this row of the group; returns the loss before it."""
-    loss = _loss(fit, group, row, grey, pairs)
+def _descend(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None = None) -> Float[Tensor, ""]:
+    """One step on the drawn photo of the group; returns the loss before it."""
+    loss = _loss(fit, group, draw, pairs)
     grads = dict(zip(fit.values, torch.autograd.grad(loss, list(fit.values.values())), strict=True))
     fit.gradients += grads["means"].norm(dim=1)
-    fit.descend(grads, means_rate)
+    fit.descend(grads, draw.means_rate)
     return loss.detach()
 
 
-def _loss(
-    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"], pairs: Capacity | None
-) -> Float[Tensor, ""]:
-    """Loss of the render of one photo in front of a grey background."""
-    photo, camera = group.images.index_select(0, row)[0], group.cameras.index_select(0, row)[0]
-    gaussians, gain = fit.gaussians(), (group.exposures.index_select(0, row)[0] @ fit.values["gains"]).exp()
-    rgb, alpha, depth, *_ = rasterise_packed(gaussians, camera, *group.size, grey.expand(3), pairs)
-    inverse = None if group.inverse is None else group.inverse.index_select(0, row)[0]
+def _loss(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None) -> Float[Tensor, ""]:
+    """Loss of the render of one photo, without the Gaussians that are left out, in front of a grey background."""
+    photo, camera = group.images.index_select(0, draw.row)[0], group.cameras.index_select(0, draw.row)[0]
+    gaussians, gain = fit.gaussians(), (group.exposures.index_select(0, draw.row)[0] @ fit.values["gains"]).exp()
+    kept = ((fit.lots + draw.lot) % 1 >= draw.dropout) / (1 - draw.dropout)  # others are more opaque instead
+    shown = replace(gaussians, opacities=gaussians.opacities * kept)
+    rgb, alpha, depth, *_ = rasterise_packed(shown, camera, *group.size, draw.grey.expand(3), pairs)
+    inverse = None if group.inverse is None else group.inverse.index_select(0, draw.row)[0]
     terms = LossTerms(SSIM_WEIGHT, DEPTH_WEIGHT, fit.camera_distance, MIN_DEPTH * fit.camera_distance)
     loss = photometric_loss(rgb, alpha, depth, gain, PhotoTarget(photo, inverse), terms)
     return loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.camera_distance

@@ -95,10 +95,10 @@ def test_darker_photo_gets_lower_exposure(target, device):
     images[0] = (images[0].float() * 0.6).to(torch.uint8)
     fit = photometric._Fit.start(true.to(device), len(views), 2.0)
     (group,) = photometric._targets(Views(tuple(images), views.cameras), (), 2.0, device)
-    black = still = torch.zeros(1, device=device)
+    zero = torch.zeros(1, device=device)
     for _ in range(100):
         for view in (0, 3):
-            photometric._descend(fit, group, torch.tensor([view], device=device), black, means_rate=still)
+            photometric._descend(fit, group, photometric._Draw(torch.tensor([view], device=device), *[zero] * 4))
     gains = group.exposures @ fit.values["gains"].detach()
     assert float(gains[0].mean()) < float(gains[3].mean())
 
@@ -109,13 +109,31 @@ def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target, d
     unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
     fit = photometric._Fit.start(concatenate([true, unseen]).to(device), len(views), 2.0)
     (group,) = photometric._targets(views, (), 2.0, device)
-    first, black = torch.tensor([0], device=device), torch.zeros(1, device=device)
-    rate = torch.tensor([1e-4], device=device)
+    zero, rate = torch.zeros(1, device=device), torch.tensor([1e-4], device=device)
+    draw = photometric._Draw(torch.tensor([0], device=device), zero, rate, zero, zero)
     for _ in range(20):
-        photometric._descend(fit, group, first, black, means_rate=rate)
+        photometric._descend(fit, group, draw)
     after = fit.gaussians().to("cpu")
     assert (after.scales[-1] < 0.95 * unseen.scales).all()
     torch.testing.assert_close(after.opacities[-1:], unseen.opacities)
+
+
+def test_what_is_left_out_of_a_step_is_a_random_share(target, device):
+    """Gaussians that are left out have no gradient; each is left out of some step."""
+    true, views = target
+    fit = photometric._Fit.start(true.to(device), len(views), 2.0)
+    (group,) = photometric._targets(views, (), 2.0, device)
+    row, zero = torch.tensor([0], device=device), torch.zeros(1, device=device)
+
+    def acts(dropout: float, lot: float) -> torch.Tensor:
+        loss = photometric._loss(fit, group, photometric._Draw(row, zero, zero, zero + dropout, zero + lot), None)
+        return torch.autograd.grad(loss, [fit.values["opacities"]])[0] != 0
+
+    visible = acts(0.0, 0.0)
+    left_out = torch.stack([visible & ~acts(0.25, lot) for lot in (0.0, 0.25, 0.5, 0.75)])
+    assert int(visible.sum()) > 200 and bool(left_out.any(0)[visible].all())
+    shares = left_out.sum(1) / visible.sum()
+    assert float(shares.min()) > 0.15 and float(shares.max()) < 0.35
 
 
 def test_exposure_excludes_parts_linear_in_the_camera_pose():

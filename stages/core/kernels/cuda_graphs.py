@@ -14,7 +14,8 @@ def captured(work: Callable[[], object], **options) -> torch.cuda.CUDAGraph:
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
     gc.disable()
     try:
-        with torch.cuda.graph(graph, **options):
+        # a stream of the current GPU: the default one is that of the first GPU on which anything was captured
+        with torch.cuda.graph(graph, stream=torch.cuda.Stream(), **options):
             work()
     finally:
         if collects:

@@ -11,9 +11,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 from stages.core.errors import InputError
 
@@ -37,24 +39,49 @@ def colmap_process() -> Iterator[subprocess.Popen]:
     if _open:
         yield _open[0]
         return
+    with _started() as process:
+        _open.append(process)
+        try:
+            yield process
+        finally:
+            _open.remove(process)
+
+
+@contextmanager
+def _started() -> Iterator[subprocess.Popen]:
     process = subprocess.Popen([sys.executable, "-c", WORKER, *map(str, sys.path)], stdin=subprocess.PIPE,
                                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)  # fmt: skip
-    _open.append(process)
     try:
         yield process
     finally:
-        _open.remove(process)
         process.kill()
         process.communicate()
 
 
-def run_colmap(task: str, folder: Path, progress: Callable[[int], object] | None = None, **arguments: object) -> None:
+class SecondProcess(NamedTuple):
+    """A process for tasks beside those of `colmap_process`, and the thread that waits for them."""
+
+    thread: ThreadPoolExecutor
+    process: subprocess.Popen
+
+
+@contextmanager
+def second_process() -> Iterator[SecondProcess]:
+    """Context with a second process, which needs a second to start; it ends with the context, and so does its task."""
+    with ThreadPoolExecutor(1) as thread, _started() as process:
+        yield SecondProcess(thread, process)
+
+
+def run_colmap(
+    task: str, folder: Path, progress: Callable[[int], object] | None = None, process: subprocess.Popen | None = None,
+    **arguments: object,
+) -> None:  # fmt: skip
     """Run a task of colmap_worker.TASKS, with arguments that JSON can hold, which writes its results to `folder`.
 
-    `progress` is called with the number of photos that are done. Raises RuntimeError where COLMAP fails, MemoryError,
-    and InputError where its process ends.
+    It runs in `process`, or else in that of `colmap_process`. `progress` is called with the number of photos that are
+    done. Raises RuntimeError where COLMAP fails, MemoryError, and InputError where its process ends.
     """
-    with colmap_process() as process:
+    with nullcontext(process) if process else colmap_process() as process:
         try:
             process.stdin.write(json.dumps([task, {"folder": str(folder), **arguments}]) + "\n")
             process.stdin.flush()

@@ -42,7 +42,6 @@ DEPTH_WEIGHT = 0.1  # of the error in inverse depth [1 / camera distance]
 MIN_DEPTH = 0.1  # rendered depth is clamped to this in the depth term [camera distances]
 SCALE_WEIGHT = 0.01  # of the mean scale [camera distances]
 DROPOUT = 0.1  # share of the Gaussians left out of a step at the end of a fit, linear in time from none
-PHOTOS = 10  # up to which it is that; it is inversely proportional to their number beyond
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,7 @@ def fit_gaussians(
     generator = torch.Generator().manual_seed(options.seed)
     splits = [round(time * steps) for time in DENSITY.split_times if steps >= DENSITY.min_iterations]
     rates = [MEANS_RATE * distance * MEANS_DECAY ** (max(step - 1, 0) / steps) for step in range(steps)]
-    dropout, lots = DROPOUT * min(1.0, PHOTOS / len(views)), _lots(steps, "cpu").tolist()
+    lots = _lots(steps, "cpu").tolist()
     order: list[int] = []
     first = 0
     with tqdm(total=steps, desc="fitting photos", unit="step", leave=False) as bar:
@@ -204,7 +203,7 @@ def fit_gaussians(
             for step in range(first, last + 1):
                 order = order or torch.randperm(len(views), generator=generator).tolist()
                 grey = float(torch.rand((), generator=generator))
-                schedule.append((order.pop(), grey, rates[step], dropout * step / steps, lots[step]))
+                schedule.append((order.pop(), grey, rates[step], DROPOUT * step / steps, lots[step]))
             kind(fit, targets, schedule).run(bar)
             if last in splits:
                 with small_operations():  # as in `_Fit.gaussians`

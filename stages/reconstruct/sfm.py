@@ -10,9 +10,13 @@ Source: Schönberger and Frahm 2016, "Structure-from-motion revisited".
 from __future__ import annotations
 
 import logging
+import shutil
 import tempfile
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from subprocess import Popen
 from types import ModuleType
 
 import numpy as np
@@ -24,7 +28,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import features, matching
-from stages.reconstruct.colmap import colmap_process, import_pycolmap, run_colmap
+from stages.reconstruct.colmap import SecondProcess, colmap_process, import_pycolmap, run_colmap, second_process
 from stages.reconstruct.epipolar import EpipolarLines
 from stages.reconstruct.matching import FOCAL_STARTS, MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
@@ -62,12 +66,14 @@ def estimate_cameras(
     steps = steps or StepCache()
     _load_pycolmap(options.seed)
     types = (SparseModel, Cameras, LensDistortion)
-    database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
-    return steps.cached("model", lambda: _run_mapper(photos, database, options.seed), types)
+    once = all(photos.focals) or len(photos) > MAX_MAPPED_TWICE
+    with nullcontext() if once else second_process() as second:  # it has started when it is needed
+        database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
+        return steps.cached("model", lambda: _run_mapper(photos, database, options.seed, second), types)
 
 
-def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
-    """The best model that COLMAP maps from the database."""
+def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess | None) -> SparseModel:
+    """The best model that COLMAP maps from the database, from another focal length too if there is a second process."""
     pairs = matching.verified_pairs(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
@@ -77,10 +83,7 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
     found = []
-    once = all(photos.focals) or len(photos) > MAX_MAPPED_TWICE
-    for factor in FOCAL_STARTS[: 1 if once else None]:
-        matching.set_unknown_focals(database, factor)
-        models = _mapped(photos, database, seed)
+    for models in _mapped_from_starts(photos, database, seed, second):
         best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
         if best is not None and best.num_reg_images() >= 2 and best.num_points3D() >= 50:
             found.append((best, models))
@@ -102,16 +105,28 @@ def _quality(model) -> tuple[int, float]:
     return model.num_reg_images(), -model.compute_mean_reprojection_error()
 
 
-def _mapped(photos: Photos, database: Path, seed: int) -> list:
+def _mapped_from_starts(photos: Photos, database: Path, seed: int, second: SecondProcess | None) -> list[list]:
+    """The models from the first of FOCAL_STARTS, and with a second process those from the second one, side by side."""
+    starts = FOCAL_STARTS if second else FOCAL_STARTS[:1]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tqdm(total=len(starts) * len(photos), desc="placing photos", unit="photo", leave=False) as bar,
+    ):
+        copies = [Path(folder) / f"{k}.db" for k in range(len(starts))]
+        for copy, factor in zip(copies, starts, strict=True):
+            shutil.copyfile(database, copy)
+            matching.set_unknown_focals(copy, factor)
+        beside = [second.thread.submit(_mapped, photos, copy, seed, bar.update, second.process) for copy in copies[1:]]
+        return [_mapped(photos, copies[0], seed, bar.update), *(run.result() for run in beside)]
+
+
+def _mapped(photos: Photos, database: Path, seed: int, progress: Callable, process: Popen | None = None) -> list:
     """The pycolmap models of photos that COLMAP's incremental mapper can join."""
     import pycolmap
 
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        tqdm(total=len(photos), desc="placing photos", unit="photo", leave=False) as bar,
-    ):
+    with tempfile.TemporaryDirectory() as folder:
         with features.writing_database(Path(folder)):
-            run_colmap("map", folder, bar.update, database=str(database), photos=len(photos), seed=seed)
+            run_colmap("map", folder, progress, process, database=str(database), photos=len(photos), seed=seed)
         return [pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())]
 
 

@@ -40,7 +40,7 @@ class QualityPreset:
 
 QUALITY_PRESETS = {
     "draft": QualityPreset(max_side=512, gaussians=50_000, iterations=300, iterations_cuda=1000, degree=0),
-    "normal": QualityPreset(max_side=640, gaussians=90_000, iterations=800, iterations_cuda=3000, degree=2),
+    "normal": QualityPreset(max_side=640, gaussians=90_000, iterations=800, iterations_cuda=2000, degree=2),
     "high": QualityPreset(max_side=1024, gaussians=300_000, iterations=3000, iterations_cuda=3500, degree=3),
 }
 

@@ -33,6 +33,7 @@ FILL_MARGIN = 0.06  # width around an object's footprint that is filled where hi
 SHADOW_WIDTH = 0.04  # width around a hole in which contact shadows are removed [camera distance]
 COMPARISON_SIGMA = 0.25  # standard deviation of the blur at which colours are compared there [SHADOW_WIDTH]
 MIN_RESIDUAL_RATIO = 3.0  # of a stained cell's colour difference to the usual inpainting error (RMS)
+SKIRT_WIDTH = 0.02  # around an object in which the table may have its colours [camera distance]
 MAX_STAINED_FRACTION = 0.25  # of the cells next to a hole; above it all of them are replaced
 SHARPENING = 0.7  # fraction of the blur between neighbouring discs that is compensated
 MIN_VISIBLE_FRACTION = 0.25  # of the cameras, for a cell of table to count as seen
@@ -94,10 +95,10 @@ def fill_background(scene: Scene, observed: ObservedSpace, support: Support, see
     view = _top_view(_diffuse(g[flat], observed), objects, support)
     if view is None:
         return scene
-    hole, near, known = _missing(view, objects, support, observed, seed)
+    hole, near, known, pure = _missing(view, objects, support, observed, seed)
     if not known.any():  # no texture to copy
         return scene
-    colour = inpaint(view.rgb, hole, known, seed)
+    colour = inpaint(view.rgb, hole, known, seed, pure=pure)
     removed = flat.clone()
     removed[flat] = torch.from_numpy(hole[view.rows_columns(g.means[flat])])
     remaining = _render_from_above(g[flat & ~removed], view.corner, view.cell, view.top, view.alpha.shape)
@@ -108,8 +109,10 @@ def fill_background(scene: Scene, observed: ObservedSpace, support: Support, see
 
 def _missing(
     view: TopView, objects: Float[Tensor, "m 3"], support: Support, observed: ObservedSpace, seed: int
-) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Masks of the cells to fill, of those under or close to objects, and of those that texture is copied from."""
+) -> tuple[Bool[np.ndarray, "h w"], ...]:
+    """Masks of the cells to fill, of those under or close to objects, of those that texture is copied from, and of
+    those so far from objects that the table has none of their colours.
+    """
     R = support.view.radius
     under = _footprint(objects, support, view)
     near = ndimage.distance_transform_edt(~under) <= FILL_MARGIN * R / view.cell
@@ -124,12 +127,12 @@ def _missing(
     hole = near & ~covered & (under | hidden)
     width = 2 * support.tolerance + view.cell
     empty = _where(hole | seen, view, support, lambda points: observed.is_free(points, width))
-    known = seen & ~hole & ~empty
+    known, pure = seen & ~hole & ~empty, ndimage.distance_transform_edt(~under) > SKIRT_WIDTH * R / view.cell
     known &= ~hidden if bool((known & ~hidden).any()) else ~hidden_under  # without cameras all cells are hidden
     hole &= ~ndimage.binary_opening(empty & hole, iterations=max(1, round(MAX_GAP * R / view.cell / 2)))
     if known.any():
-        hole |= _stained(view, _Cells(hole, seen & near, known, hidden_under), SHADOW_WIDTH * R / view.cell, seed)
-    return hole, near, known
+        hole |= _stained(view, _Cells(hole, seen & near, known, hidden_under, pure), SHADOW_WIDTH * R / view.cell, seed)
+    return hole, near, known, pure
 
 
 class _Cells(NamedTuple):
@@ -139,6 +142,7 @@ class _Cells(NamedTuple):
     seen_near: Bool[np.ndarray, "h w"]  # of known colour, under or close to objects
     known: Bool[np.ndarray, "h w"]  # that texture is copied from
     hidden_under: Bool[np.ndarray, "h w"]  # under objects, seen by few cameras
+    pure: Bool[np.ndarray, "h w"]  # away from objects
 
 
 def _discs(view: TopView, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:
@@ -166,7 +170,7 @@ def _stained(view: TopView, cells: _Cells, width: float, seed: int) -> Bool[np.n
     hole, known, hidden_under = cells.hole, cells.known, cells.hidden_under
     suspect = cells.seen_near & ~hole & (hidden_under | _adjacent(hole | hidden_under, width))
     reference = known & ~suspect & (ndimage.distance_transform_edt(~(hole | suspect)) <= width)
-    table = inpaint(view.rgb, hole | suspect | reference, known, seed, rounds=0)
+    table = inpaint(view.rgb, hole | suspect | reference, known, seed, rounds=0, pure=cells.pure)
     images = (_blurred(rgb, suspect | reference, COMPARISON_SIGMA * width) for rgb in (view.rgb, table))
     seen, expected = (cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB) for rgb in images)
     difference = np.linalg.norm(seen - expected, axis=2)

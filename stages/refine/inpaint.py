@@ -47,18 +47,26 @@ def inpaint(
     known: Bool[np.ndarray, "h w"],
     seed: int,
     rounds: int = ROUNDS,
+    pure: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """The image with the holes filled; pixels that are neither hole nor known are unchanged and not copied from.
 
-    Fewer `rounds` of search at full size, or none, are faster and give a more blurred result.
+    Fewer `rounds` of search at full size, or none, are faster and give a more blurred result. Where the known pixels
+    are too few to copy texture from, colours are interpolated between those of them that are `pure`.
     """
     known = known & ~hole
     if not known.any() or not hole.any():
         return rgb
-    smooth = _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
-    image = np.rint(COLOUR * np.where(known[..., None], rgb, smooth))
-    image = _fill(image, hole, known, np.random.default_rng(seed), rounds) / COLOUR
-    return np.where(hole[..., None], image, rgb).clip(0, 1).astype(rgb.dtype)
+    image = _fill(np.rint(COLOUR * _interpolated(rgb, known)), hole, known, np.random.default_rng(seed), rounds)
+    if image is None:
+        between = known if pure is None or not (known & pure).any() else known & pure
+        image = COLOUR * _interpolated(rgb, between)
+    return np.where(hole[..., None], image / COLOUR, rgb).clip(0, 1).astype(rgb.dtype)
+
+
+def _interpolated(rgb: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """The image with all but the known pixels interpolated."""
+    return _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
 
 
 def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -150,8 +158,10 @@ class _Level:
         self.image[self.hole] += over[self.hole].clip(-MAX_ILLUMINATION * COLOUR, MAX_ILLUMINATION * COLOUR)
 
 
-def _fill(image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int) -> np.ndarray:
-    """The image with its hole filled, from the coarsest level to the finest."""
+def _fill(
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int
+) -> np.ndarray | None:
+    """The image with its hole filled, from the coarsest level to the finest; None where too few patches are known."""
     levels = [_Level.of(image, hole, known)]
     while ndimage.distance_transform_edt(hole).max() > MAX_DEPTH:
         image, hole, known = _downsample(image, hole, known)
@@ -161,7 +171,7 @@ def _fill(image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random
             break
         levels.append(coarser)
     if levels[0].source.sum() <= MIN_SOURCE_RATIO * len(levels[0].at):
-        return levels[0].image  # too few sources: interpolated colours
+        return None
     found = _best_trial(levels[-1], rng)
     for level in levels[-2::-1]:
         found = _refine(level, found, rng, ROUNDS if level is not levels[0] else rounds)

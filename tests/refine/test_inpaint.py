@@ -33,6 +33,16 @@ def test_brightness_gradient_continues_without_a_seam():
     assert (out[~middle()] == rgb[~middle()]).all()
 
 
+def test_colours_are_interpolated_between_pure_pixels_where_too_few_are_known():
+    """Around the hole the table has colours of the object; only stripes of it are known, too narrow to copy from."""
+    hole, y = middle(40), np.mgrid[:SIDE, :SIDE][0]
+    known = ~hole & (y % 6 < 2)
+    beside = middle(52)
+    rgb = np.where(beside[..., None], np.float32([0.1, 0.1, 0.3]), np.float32([0.7, 0.6, 0.5]))
+    plain, pure = (inpaint(rgb, hole, known, 0, pure=mask) for mask in (None, ~beside))
+    assert np.abs(pure[hole] - [0.7, 0.6, 0.5]).max() < 0.01 < 0.3 < np.abs(plain[hole] - [0.7, 0.6, 0.5]).max()
+
+
 @pytest.mark.parametrize("shade", [0.0, 0.3], ids=["even", "lit from one side"])
 def test_checker_pattern_continues(shade):
     """A period of 12 cells: what is copied must be in step with what is around, at both sides of the hole."""

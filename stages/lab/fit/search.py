@@ -151,7 +151,7 @@ def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Es
     other steadily, tell nothing about each.
     """
     x, deviations = descend(sims, frames, known, error), WIDER * known.deviations
-    for _ in range(SETTLING):
+    for _ in tqdm(range(SETTLING), desc="intervals", unit="pass"):
         known = narrowed(sims, frames, Estimate(x, np.diag(np.minimum(deviations, PRIOR))), error, FAR)
         deviations = known.deviations
     return known

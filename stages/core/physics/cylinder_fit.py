@@ -6,7 +6,8 @@ directions across a cylinder are the same to one of both, 1.7 and 2 radii, they 
 
 As for balls (`ball_fit.py`), noise differs from one place to the next and another shape does not: so the median
 distance of neighbours has to be small, on the curved side and on each end, since ends fit whatever stands between
-them. The limits are those of balls: a prism of eight sides is no cylinder, one of twelve is.
+them. The limits are those of balls: a prism of eight sides is no cylinder, one of twelve is. Of a thin plate all points
+are near the ends of a disc around it, which it does not fill.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from stages.core.kernels.threads import small_operations
 from stages.core.physics.ball_fit import CONVERGED, MAX_POINTS, MAX_STEPS, SHARES
 
 NEIGHBOURS = 20  # points of which the median distance counts, as many as there are in a direction of a ball
+FILLED = 0.9  # least fraction of a cylinder that the hull fills: .95 of the one around a prism of twelve sides
 MIN_POINTS = 4  # on the side and on each end: three are on one plane anyway
 Vector = Float[np.ndarray, "3"]
 
@@ -64,7 +66,8 @@ def fitted_cylinder(points: Float[np.ndarray, "n 3"], hull: ConvexHull) -> Cylin
     """The cylinder on whose surface those points lie; None where there is none. `hull` is their convex hull."""
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
     fits = (_least_absolute_distances(points, axis) for axis in _principal_axes(points, hull))
-    best = min((c for c in fits if c is not None), key=lambda c: np.abs(c.distances(points)[0]).mean(), default=None)
+    fits = (c for c in fits if c is not None and hull.volume >= FILLED * c.volume)
+    best = min(fits, key=lambda c: np.abs(c.distances(points)[0]).mean(), default=None)
     if best is None:
         return None
     distance, part = best.distances(points)

@@ -63,6 +63,9 @@ def test_cylinders_of_all_heights(height, n, noise):
 OTHERS = {
     "cube": box_samples((2, 2, 2), 4000),
     "box": box_samples((2, 2, 3), 4000),
+    "plank": box_samples((40, 7, 1), 4000),
+    "rod": box_samples((100, 1, 1), 4000),
+    "half a disc": cylinder(0.04, 8000)[cylinder(0.04, 8000)[:, 0] > 0],
     "prism of 6": prism(6),
     "prism of 8": prism(8),
     "ball": ball_samples(4000),

@@ -34,7 +34,7 @@ class InitialOverlaps:
 
     def __init__(self, model, data):
         """`data` has the contacts at the start."""
-        deep = data.contact.dist < 0
+        deep = (data.contact.dist < 0) & (data.contact.exclude == 0)
         self._pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
         at_start = np.zeros(len(self._pairs))
         np.maximum.at(at_start, row.ravel(), -data.contact.dist[deep])

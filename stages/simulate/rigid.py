@@ -4,7 +4,8 @@ Units are those of the scene's own scales, so that no constant of the solver dep
 object's longest side, the median mass, and SUBSTEPS substeps.
 
 Contacts rebound and have exact Coulomb friction (`contact_forces.py`); that of a pair is the larger coefficient, as in
-the other engines. Round bodies are balls or cylinders, which a loss of energy in the contact slows down as they roll.
+the other engines. Round bodies are balls or cylinders, which a loss of energy in the contact slows down as they roll;
+sides of cylinders touch along a line (`cylinder_contacts.py`).
 Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
 (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
 is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.
@@ -35,6 +36,7 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.background import background_boxes
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.contact_forces import find_contact_forces
+from stages.simulate.cylinder_contacts import CylinderContacts
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
@@ -177,7 +179,8 @@ class _World:
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
         lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
-        mujoco.mj_fwdPosition(self.model, self.data)
+        self._cylinders = CylinderContacts(mujoco, self.model)
+        self._find_positions()
         self._overlaps = InitialOverlaps(self.model, self.data)
         self._surfaces = self._surface_contacts(setup, options) if not all(b.shape.convex for b in bodies) else None
         self._edges = None if table is None else self._table_edges(table)
@@ -251,7 +254,7 @@ class _World:
         unit = self.scene.metres_per_unit / self.units.length
         lift = setup.lift.double().numpy() * unit
         self.model.geom_margin[:] = SUPPORT_GAP
-        self._mujoco.mj_fwdPosition(self.model, self.data)
+        self._find_positions()
         stances, touching = [], self._touching()
         for i, b in enumerate(self.bodies):
             points = b.shape.hull.double() * unit
@@ -268,9 +271,10 @@ class _World:
         """Pairs (k, 2) of bodies with gaps of up to SUPPORT_GAP, and normals (k, 3) from the first to the second."""
         contact = self.data.contact
         pairs, normal = self.model.geom_bodyid[contact.geom], contact.frame[:, :3]
+        kept = contact.exclude == 0
         if self._surfaces is None:
-            return pairs, normal
-        kept, near = ~self._surfaces.replaced(contact.geom), self._surfaces.touching(self.data)
+            return pairs[kept], normal[kept]
+        kept, near = kept & ~self._surfaces.replaced(contact.geom), self._surfaces.touching(self.data)
         return np.concatenate([pairs[kept], near[0]]), np.concatenate([normal[kept], near[1]])
 
     def release(self, rows: Iterable[int]) -> None:
@@ -306,9 +310,7 @@ class _World:
     def _find_forces(self) -> None:
         """As mj_forward, with other contacts and references."""
         mujoco, model, data = self._mujoco, self.model, self.data
-        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
-                      mujoco.mj_collision):  # fmt: skip
-            stage(model, data)
+        self._find_positions()
         found = data.ncon
         if self._surfaces is not None:
             self._surfaces.exclude(data)
@@ -327,6 +329,14 @@ class _World:
             find_contact_forces(mujoco, model, data, self._restitution)
         else:
             mujoco.mj_fwdConstraint(model, data)
+
+    def _find_positions(self) -> None:
+        """As mj_fwdPosition up to the contacts, with those of cylinders."""
+        mujoco = self._mujoco
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
+                      mujoco.mj_collision):  # fmt: skip
+            stage(self.model, self.data)
+        self._cylinders.replace(self.data)
 
     def _centre_gyroscopic_torques(self) -> None:
         """Take them at the angular velocities in the middle of the substep, by a step of Newton's method: MuJoCo takes

@@ -304,7 +304,6 @@ class AddedContacts(NamedTuple):
 def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
     """Add contacts to those found by mj_collision."""
     contact, before = mujoco.MjContact(), data.ncon
-    contact.dim = 3
     for name in ("flex", "elem", "vert"):
         getattr(contact, name)[:] = -1
     for _ in range(len(contacts.x)):
@@ -318,7 +317,8 @@ def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
     # as MuJoCo combines those of two geometries: without any friction its elliptic cones have no normal force either
     friction = np.maximum(model.geom_friction[one], model.geom_friction[two]).clip(mujoco.mjMINMU)
     added.friction[new] = friction[:, [0, 0, 1, 2, 2]]
-    added.solimp[new] = model.geom_solimp[one]
+    added.dim[new] = np.maximum(model.geom_condim[one], model.geom_condim[two])
+    added.solref[new], added.solimp[new] = model.geom_solref[one], model.geom_solimp[one]
 
 
 def _ordered(shape: SurfaceShape, order: np.ndarray) -> SurfaceShape:

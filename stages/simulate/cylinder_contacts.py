@@ -1,0 +1,77 @@
+"""Contacts between the curved sides of cylinders, in place of MuJoCo's.
+
+MuJoCo finds one contact for two cylinders side by side, at one end or the other, and where they just touch a normal and
+a depth that are far off. Here they touch where their axes cross, and at both ends of the length along which they are
+beside each other. Contacts with an end of a cylinder stay MuJoCo's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.simulate.surface_contacts import AddedContacts, add_contacts
+
+LEANING = 0.1  # sine of the angle between an axis and the plane across which sides touch: beyond, edges do
+
+
+class CylinderContacts:
+    """Finds the contacts of the sides of a MuJoCo model's cylinders."""
+
+    def __init__(self, mujoco, model):
+        self._mujoco, self._model = mujoco, model
+        geoms = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER)
+        pairs = np.stack(np.triu_indices(len(geoms), 1), 1)
+        moves = model.body_dofnum[model.geom_bodyid[geoms]] > 0
+        self._pairs = geoms[pairs[moves[pairs].any(1)]]
+
+    def replace(self, data) -> None:
+        """Exclude MuJoCo's contacts of pairs whose sides touch, and add others."""
+        if not len(self._pairs):
+            return
+        reach = self._model.geom_rbound[self._pairs].sum(1)
+        pairs = self._pairs[np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) < reach]
+        if not len(pairs):
+            return
+        size = self._model.geom_size[pairs]
+        row, x, normal, depth, beside = side_contacts(
+            data.geom_xpos[pairs], data.geom_xmat[pairs][:, :, 2::3], size[:, :, 0], size[:, :, 1]
+        )
+        count = self._model.ngeom
+        numbers = pairs[beside].min(1) * count + pairs[beside].max(1)
+        found = data.contact.geom
+        replaced = np.isin(found.min(1) * count + found.max(1), numbers)
+        data.contact.exclude[replaced] = 1
+        k = np.flatnonzero(depth > -self._model.geom_margin[pairs[row]].max(1))
+        add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], depth[k], pairs[row[k]]))
+
+
+def side_contacts(
+    centre: np.ndarray, axis: np.ndarray, radius: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Contacts of the sides of pairs (k, 2) of cylinders; negative depths are gaps.
+
+    `half` is half their length. Rows (n,) of the pairs, positions (n, 3), normals (n, 3) from the first to the second
+    cylinder, depths (n,); and which pairs (k,) are beside each other, so that their sides touch if anything does.
+    """
+    (a, b), (u, v), between = centre.swapaxes(0, 1), axis.swapaxes(0, 1), centre[:, 1] - centre[:, 0]
+    cosine, along_u, along_v = ((one * two).sum(1) for one, two in ((u, v), (between, u), (between, v)))
+    # places s on the first axis of which the nearest one of the second axis, s cosine - along_v, is on that cylinder
+    slope = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
+    ends = (along_v + np.array([[-1.0], [1.0]]) * half[:, 1]) / slope
+    low, high = np.maximum(ends.min(0), -half[:, 0]), np.minimum(ends.max(0), half[:, 0])
+    across = 1 - cosine**2
+    nearest = (along_u - cosine * along_v) / np.maximum(across, 1e-12)
+    nearest = np.where(across > 1e-12, nearest, (low + high) / 2).clip(low, np.maximum(low, high))
+    s = np.stack([low, nearest, high], 1)
+    t = s * cosine[:, None] - along_v[:, None]
+    way = (b - a)[:, None] + t[..., None] * v[:, None] - s[..., None] * u[:, None]  # between the axes, (k, 3, 3)
+    distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
+    normal = way / distance[..., None]
+    leaning = np.abs((normal * u[:, None]).sum(2))
+    depth = radius[:, :1] * np.sqrt(1 - leaning.clip(0, 1) ** 2) + radius[:, 1:] - distance
+    beside = (high - low > np.maximum(depth[:, 1], 0)) & (leaning[:, 1] < LEANING)
+    both = np.minimum(depth[:, 0], depth[:, 2]) > 0
+    inner = (nearest > low) & (nearest < high) & ~both
+    row, k = np.nonzero(beside[:, None] & np.stack([np.ones_like(inner), inner, np.ones_like(inner)], 1))
+    x = b[row] + t[row, k, None] * v[row] - (radius[row, 1] - depth[row, k] / 2)[:, None] * normal[row, k]
+    return row, x, normal[row, k], depth[row, k], beside

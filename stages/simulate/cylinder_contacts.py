@@ -28,21 +28,25 @@ class CylinderContacts:
         """Exclude MuJoCo's contacts of pairs whose sides touch, and add others."""
         if not len(self._pairs):
             return
-        reach = self._model.geom_rbound[self._pairs].sum(1)
-        pairs = self._pairs[np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) < reach]
+        model, (a, b) = self._model, self._pairs.T
+        kind, other = model.geom_contype, model.geom_conaffinity
+        collide = (kind[a] & other[b]) | (kind[b] & other[a])
+        distance, reach = np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b], axis=1), model.geom_rbound
+        pairs = self._pairs[(collide != 0) & (distance < reach[a] + reach[b])]
         if not len(pairs):
             return
-        size = self._model.geom_size[pairs]
+        size = model.geom_size[pairs]
         row, x, normal, depth, beside = side_contacts(
             data.geom_xpos[pairs], data.geom_xmat[pairs][:, :, 2::3], size[:, :, 0], size[:, :, 1]
         )
-        count = self._model.ngeom
+        count = model.ngeom
         numbers = pairs[beside].min(1) * count + pairs[beside].max(1)
         found = data.contact.geom
         replaced = np.isin(found.min(1) * count + found.max(1), numbers)
         data.contact.exclude[replaced] = 1
-        k = np.flatnonzero(depth > -self._model.geom_margin[pairs[row]].max(1))
-        add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], depth[k], pairs[row[k]]))
+        data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        k = np.flatnonzero(depth > -model.geom_margin[pairs[row]].max(1))
+        add_contacts(self._mujoco, model, data, AddedContacts(x[k], normal[k], depth[k], pairs[row[k]]))
 
 
 def side_contacts(

@@ -25,7 +25,7 @@ import numpy as np
 from stages.simulate.rigid_model import OMEGA
 
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
-MAX_TURNS = 20  # of impacts in a substep; what approaches then rebounds in the next one
+MAX_TURNS = 20  # of impacts; a light body between heavy ones would need hundreds, so that all contacts take the last
 APART = -1e9  # reference of a contact that takes no part
 MAX_PASSES = 8  # of the solver for exact friction; in each the error of a sliding box shrinks by mu^2 / (1 + mu^2)
 SLIP_TOLERANCE = 0.01  # error of a contact's normal acceleration with which they end, relative to gravity plus itself
@@ -39,18 +39,21 @@ def find_contact_forces(mujoco, model, data, restitution: np.ndarray) -> None:
     do so where bodies are hit at several points at once.
     """
     force, free = data.qfrc_smooth.copy(), data.qacc_smooth.copy()
-    change = np.zeros(data.nefc)  # of the velocities of the contacts by impacts, divided by the timestep
-    for _ in range(MAX_TURNS):
-        references = set_references(data, model.opt.timestep, restitution, change)
-        if not references[2].any():
+    timestep, change = model.opt.timestep, np.zeros(data.nefc)  # of the contacts' velocities by impacts / timestep
+    for turn in range(MAX_TURNS):
+        normal, friction, rebounds = set_references(data, timestep, restitution, change)
+        if not rebounds.any():
             break
-        _collide(mujoco, model, data, *references, data.qvel + model.opt.timestep / 2 * (data.qacc_smooth - free))
+        if turn < MAX_TURNS - 1:
+            data.efc_aref[normal[~rebounds]] = APART
+        velocity = data.qvel + timestep / 2 * (data.qacc_smooth - free)
+        _collide(mujoco, model, data, normal, friction, rebounds, velocity)
         data.qfrc_smooth += data.qfrc_constraint
         data.qacc_smooth[:] = data.qacc
         mujoco.mj_mulJacVec(model, data, change, data.qacc - free)
     else:
-        references = set_references(data, model.opt.timestep, np.zeros_like(restitution), change)
-    solve(mujoco, model, data, *references)
+        normal, friction, rebounds = set_references(data, timestep, np.zeros_like(restitution), change)
+    solve(mujoco, model, data, normal, friction, rebounds)
     data.qfrc_constraint += data.qfrc_smooth - force
     data.qfrc_smooth[:], data.qacc_smooth[:] = force, free
 
@@ -58,12 +61,12 @@ def find_contact_forces(mujoco, model, data, restitution: np.ndarray) -> None:
 def _collide(
     mujoco, model, data, normal: np.ndarray, friction: np.ndarray, rebounds: np.ndarray, velocity: np.ndarray
 ) -> None:
-    """Solve for the impacts of the contacts that rebound, of references as `set_references` sets them.
+    """Solve for the impacts of the contacts that rebound, with the references that are set.
 
     `velocity` and half of what accelerates in the substep are the mean velocity, on which the work of impacts depends.
     """
     timestep = model.opt.timestep
-    wanted = data.efc_aref[normal] = np.where(rebounds, data.efc_aref[normal], APART)
+    wanted = data.efc_aref[normal]
     solve(mujoco, model, data, normal, friction, rebounds)
     work = data.qfrc_constraint * (velocity + data.qacc * timestep / 2)
     of_island = np.bincount(data.dof_island + 1, work)  # the first is that of bodies without contacts

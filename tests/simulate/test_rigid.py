@@ -186,6 +186,15 @@ def test_a_cylinder_stands_on_its_end(tmp_path):
     assert float(t.rotation[-1, 0, 1:].norm()) < 1e-3
 
 
+def test_a_heavy_box_that_falls_on_a_card_lies_on_it(tmp_path):
+    """On 2 mm that weigh 1/160 of it: the card would need hundreds of impacts on box and floor to stop the box."""
+    card = box((0.09, 0.06, 0.002), 0.003).moved((0.0, 0.0, 0.001))
+    t = roll(tmp_path, card, cube(0.12, 0.02, 0.022), steps=40)
+    low = (t.positions[-1, t.keypoints.object_id == 2, 2]).min()
+    assert float(low) == pytest.approx(0.002, abs=3e-4)  # a thousandth of the card's length, and points of surfaces
+    assert float(t.positions[:, t.keypoints.object_id == 1, 2].min()) > -3e-4
+
+
 def test_a_fall_of_half_a_percent_of_the_size_ends_without_a_rebound(tmp_path):
     """Also of a material that loses nothing: it would bounce for seconds."""
     t = roll(tmp_path, FLAT, lift=("0.001",), loss=0.0, dt=0.005, steps=24)

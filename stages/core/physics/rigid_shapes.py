@@ -25,6 +25,9 @@ from stages.core.scene.scene import Scene
 
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
 MAX_VERTICES = 200  # of a hull: an egg is round to 1 %
+THIN = 4.0  # mean thickness of a hull up to which the volume of voxels does not tell that it is filled [voxels]
+COVERED = 1.5  # distance from a voxel of the body up to which the surface of a thin hull is covered [voxels]
+COVER = 0.98  # share of its surface that is
 HULL_SUBSET = 2000  # points of which the hull tells that an object does not fill that of all
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
@@ -163,9 +166,22 @@ def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
         points,
     ):  # the hull of some is smaller, and found in no time
         hull = _hull(some)
-        if hull is None or hull.volume * CONVEX >= solid.moments[0]:
+        if hull is None or (hull.volume * CONVEX >= solid.moments[0] and not _covers(solid, hull)):
             return None
     return hull
+
+
+def _covers(solid: Solid, hull: ConvexHull) -> bool:
+    """Whether a body is all over the surface of a hull as thin as a few voxels, and so fills it."""
+    if 2 * hull.volume > THIN * solid.h * hull.area:
+        return False
+    corners = hull.points[hull.simplices]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    rng = np.random.default_rng(0)
+    shares = rng.dirichlet((1, 1, 1), HULL_SUBSET)
+    x = (shares[..., None] * corners[rng.choice(len(area), HULL_SUBSET, p=area / area.sum())]).sum(1)
+    near = cKDTree(solid.voxels).query(x, distance_upper_bound=COVERED * solid.h)[0] < np.inf
+    return float(near.mean()) > COVER
 
 
 def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:

@@ -181,3 +181,24 @@ def test_a_flat_box_is_convex():
     """Its height of 12.8 voxels is not a whole number, which must not make it look hollow."""
     (shape,) = rigid_shapes(scene(box((0.3, 0.2, 0.08), 0.011)))
     assert shape.convex and shape.volume == pytest.approx(0.0048, rel=0.02)
+
+
+CARD = box((0.09, 0.06, 0.002), 0.003)
+
+
+def test_a_card_that_is_as_thin_as_a_voxel_has_its_volume():
+    """45 times as wide as thick; its voxels have two thirds of that. But for half a spacing at its edges."""
+    shape = rigid_shapes(scene(CARD))[0]
+    sides = CARD.points.amax(0) - CARD.points.amin(0)
+    assert shape.convex and shape.volume == pytest.approx(float(sides.prod()), rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["angle", "bent"])
+def test_thin_plates_with_another_outline_or_bent_are_not_convex(name):
+    """Of an L of three quarters of the card, and of a card with its ends 6 mm above its middle."""
+    x = CARD.points
+    if name == "angle":
+        plate = CARD.kept((x[:, 0] < 0) | (x[:, 1] < 0))
+    else:
+        plate = Surface(x + torch.tensor([0.0, 0.0, 3.0]) * x[:, :1].square(), CARD.normals)
+    assert not rigid_shapes(scene(plate))[0].convex

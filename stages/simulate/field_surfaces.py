@@ -79,7 +79,7 @@ class _Shape:
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (p, 3) of the surface, outward normals (p, 3), and which (p,) are at edges and corners of a hull."""
         if self.hull is None:
-            points, normals = self.surface.samples()
+            points, normals = self.surface.samples_above(self.floor)
             at_edge = np.zeros(len(points), bool)
         else:
             points = self.surface.points[self.surface.thinned()]

@@ -75,9 +75,8 @@ def object_shape(
 def surface_shape(body: SolidSurface, bottom: float, frame: BodyFrame, convex: bool) -> SurfaceShape:
     """The shape of a body that ends at the height `bottom`, in this frame."""
     com, scale = np.array(frame.com), frame.scale
-    points, normals = body.fitted.samples()
-    above = points[:, 2] > bottom
-    points, normals = scale * (points[above] - com), normals[above]
+    points, normals = body.fitted.samples_above(bottom)
+    points = scale * (points - com)
     depth, low = body.fitted.depth_grid()
     height = low[2] + body.h * np.arange(depth.shape[2])
     depth, low, h = scale * np.minimum(depth, height - bottom), scale * (low - com), scale * body.h

@@ -23,6 +23,7 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
+from stages.lab.bench.experiments.bodies import compound
 from stages.simulate.contact_forces import MAX_PASSES, REST_SPEED, set_references, solve
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.rigid_model import OMEGA, restitution
@@ -184,6 +185,15 @@ def test_a_cylinder_stands_on_its_end(tmp_path):
     t = roll(tmp_path, random_cylinder((0, 1, 2)), steps=30)
     assert float((t.com[-1] - t.com[0]).norm()) < 1e-3
     assert float(t.rotation[-1, 0, 1:].norm()) < 1e-3
+
+
+def test_a_tray_that_stood_on_the_floor_has_an_underside_that_falls_on_a_ball(tmp_path):
+    """It is lifted from over a small ball and let fall: the ball must not enter it, of which it is in the middle."""
+    parts = [((0.3, 0.3, 0.03), (0, 0, 0.015)), *(((0.03, 0.3, 0.12), (x, 0, 0.06)) for x in (-0.135, 0.135))]
+    ball = ellipsoid((0.05,) * 3, 1500).moved((0.0, 0.0, 0.05))
+    t = roll(tmp_path, compound(0.012, *parts), ball, lift=("1=.3",), loss=0.6, steps=20)
+    assert float(t.com[-1, 1, 2]) == pytest.approx(0.05, abs=2e-3)
+    assert float(t.positions[-1, t.keypoints.object_id == 1, 2].min()) > 0.09
 
 
 def test_a_heavy_box_that_falls_on_a_card_lies_on_it(tmp_path):

@@ -136,10 +136,25 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     shape = surface_shape(body, -0.125, BodyFrame(tuple(com), 2.0), convex=False)
     at = np.round((2 * (np.array([0.0, 0.0, -0.09]) - com) - shape.low) / shape.h).astype(int)
     assert shape.depth[tuple(at)] == pytest.approx(2 * 0.035, abs=0.03) and shape.h == pytest.approx(0.04)
-    assert (shape.points[:, 2] / 2 + com[2]).min() > -0.125
     x = shape.points / 2 + com
+    assert x[:, 2].min() == pytest.approx(-0.125)
+    under = x[(shape.normals[:, 2] == -1) & (np.abs(x[:, :2]) < 0.45).all(1)]
+    assert len(under) > 1000 and np.abs(under[:, 2] + 0.125).max() < 1e-9
     top = x[(shape.normals[:, 2] > 0.9) & (np.abs(x[:, :2]) < 0.45).all(1)]  # edges are rounded
     assert len(top) > 1000 and np.abs(top[:, 2] - 0.25).max() < 0.003
+
+
+@pytest.mark.parametrize("gap", [-0.03, -0.004, 0.0, 0.001, 0.004, 0.01])
+def test_a_body_that_ends_about_at_the_floor_has_one_underside(gap):
+    """A slab, with voxels of .01, whose underside is that far from the floor, below which it is cut off."""
+    line = np.arange(-0.495, 0.5, 0.01)
+    high = np.arange(0.005, 0.1, 0.01)
+    points = box((1.0, 1.0, 0.1), 0.01).points.double().numpy() + [0, 0, 0.05]
+    body = SolidSurface(np.stack(np.meshgrid(line, line, high, indexing="ij"), -1).reshape(-1, 3), 0.01, points)
+    x, normals = body.fitted.samples_above(-gap)
+    under = (normals[:, 2] < -0.9) & (np.abs(x[:, :2]) < 0.45).all(1)
+    assert np.abs(x[under, 2] - max(0.0, -gap)).max() < 0.0025 + 1e-9 and (x[:, 2] >= -gap).all()
+    assert 7000 < under.sum() < 10000  # one in each voxel
 
 
 def test_depths_on_the_grid_are_those_at_its_nodes():

@@ -34,6 +34,7 @@ FLATNESS = 0.1  # distance at which weights fall even if the others are closer [
 AT_EDGE = 0.2  # RMS distance of neighbours from the plane of a sample that is at an edge [spacing of the samples]
 FLATTER = 0.5  # ratio of that of a sample beside it, on a face, at most
 ON_PLANE = 0.2  # distance from the plane of that face [spacing of the samples]
+ON_CUT = 0.25  # distance from where a body is cut off up to which a face is taken to be there [voxels]
 OCTANTS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
@@ -161,6 +162,24 @@ class SolidSurface:
         rows = self.thinned()
         points, normals = self.points[rows], self.normals[rows]
         return points + self.depth(points)[:, None] * normals, normals
+
+    def samples_above(self, bottom: float) -> tuple[np.ndarray, np.ndarray]:
+        """Those above a height, and others on the face at which the body ends there, with the same spacing."""
+        points, normals = self.samples()
+        kept = points[:, 2] > bottom - ON_CUT * self.h
+        points, normals = np.maximum(points[kept], [-np.inf, -np.inf, bottom]), normals[kept]
+        x, y = (self._first[a] + self.h * np.arange(self._full.shape[a]) for a in (0, 1))
+        face = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), bottom)], -1).reshape(-1, 3)
+        face = face[self._ends_at(face)]
+        replaced = (normals[:, 2] < -SAME_FACE) & (points[:, 2] < bottom + ON_CUT * self.h)
+        replaced[replaced] = self._ends_at(points[replaced] * [1, 1, 0] + [0, 0, bottom])
+        down = np.tile([0.0, 0.0, -1.0], (len(face), 1))
+        return np.concatenate([points[~replaced], face]), np.concatenate([normals[~replaced], down])
+
+    def _ends_at(self, x: np.ndarray) -> np.ndarray:
+        """Whether (k,) a body that is cut off at the height of points (k, 3) ends there, not in a face above."""
+        depth, _ = self.depth_grid()
+        return self._at(depth, x + [0, 0, self.h / 2]) > (0.5 - ON_CUT) * self.h
 
     def thinned(self) -> np.ndarray:
         """Rows (s,) of the first of the points in each voxel that has any."""

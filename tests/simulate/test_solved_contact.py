@@ -11,7 +11,7 @@ from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
-from stages.lab.bench.experiments.bodies import bowl, compound
+from stages.lab.bench.experiments.bodies import bowl, compound, tilted
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import measure
@@ -112,3 +112,37 @@ def test_nothing_passes_through_a_wall_in_a_step(device, name):
         assert float(com[-1, 2]) > 0.5
     else:
         assert float(com[:, 0].min()) > -0.21
+
+
+def test_an_edge_slides_along_a_face_without_a_jolt(device):
+    """A ladder between a wall and a floor without friction, until it has turned from 60 to 40 degrees.
+
+    It is let go at the angle start; both edges of its lower side touch. Lagrange's equation of its only coordinate,
+    theta: (I + x'^2 + z'^2) theta'' = -g z' - (x' x'' + z' z'') theta'^2, for the place x, z of its middle [per mass].
+    """
+    length, thick, angle, rate, dt = 1.0, 0.1, math.radians(60), 0.0, 1e-5
+    for _ in range(30_000):
+        sine, cosine = math.sin(angle), math.cos(angle)
+        x1, z1 = (thick * cosine - length * sine) / 2, (length * cosine - thick * sine) / 2
+        x2, z2 = -(thick * sine + length * cosine) / 2, -(length * sine + thick * cosine) / 2
+        inertia = (length**2 + thick**2) / 12 + x1**2 + z1**2
+        rate -= dt * (9.81 * z1 + (x1 * x2 + z1 * z2) * rate**2) / inertia
+        angle += dt * rate
+    faces = []
+    for axis, sides in enumerate(((0.2, thick), (length, thick), (length, 0.2))):
+        grid = torch.cartesian_prod(*(torch.linspace(-s / 2, s / 2, round(s / 0.01) + 1) for s in sides))
+        for side in (-1.0, 1.0):
+            height, across = side * (length, 0.2, thick)[axis] / 2, [a for a in range(3) if a != axis]
+            points, normals = torch.full((len(grid), 3), height), torch.zeros(len(grid), 3)
+            points[:, across], normals[:, axis] = grid, side
+            faces.append(Surface(points, normals))
+    plank = tilted(Surface(*(torch.cat([getattr(f, n) for f in faces]) for n in ("points", "normals"))), 60)
+    low = plank.points.amin(0)
+    bodies = box((0.1, 0.6, 1.2), 0.03).moved((-0.05, 0, 0.6)), plank.moved((-float(low[0]), 0.0, -float(low[2])))
+    parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1, widest=math.inf) for i, s in enumerate(bodies)]
+    scene = Scene(concatenate(parts), (SceneObject(1, "wall"), SceneObject(2, "ladder")), None, 0.0)
+    options = SimulateOptions(engine="ngff", contact="solved", steps=31, dt=0.01, friction=0.0, pin=("1",),
+                              keypoints=128, device=device)  # fmt: skip
+    t = roll_out(scene, options)
+    turned = 2 * math.atan2(float(t.rotation[-1, 1, 2].abs()), float(t.rotation[-1, 1, 0].abs()))
+    assert turned == pytest.approx(math.radians(60) - angle, rel=0.02)

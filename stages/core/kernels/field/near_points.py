@@ -84,6 +84,26 @@ def _way_of_a_step(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -
 
 
 @wp.func
+def _ends_at_face(
+    s: SurfaceArrays, motion: BodyMotion, scene: int, point: NearPoint, own: wp.vec3, depth: float, face: wp.vec3
+) -> bool:
+    """Whether an edge of body a touches a face of b, and not the other way round, near a point at this depth in b.
+
+    `own` is the normal of a's face there, and `face` that of b's in its frame: b's goes on below the point, and a's
+    does not beyond the line in which both meet.
+    """
+    normal = motion.R[scene, point.b] * face
+    below = point.at + (depth - s.spacing[point.b]) * normal
+    if depth_at(s, point.b, in_body_frame(motion, scene, point.b, below))[3] < 0.5 * s.spacing[point.b]:
+        return False
+    across = normal - wp.dot(normal, own) * own
+    sine = wp.max(wp.length(across), 1.0e-6)
+    spacing = s.spacing[point.a]
+    beyond = point.at - (wp.max(-depth, 0.0) / sine + spacing) / sine * across - spacing * own
+    return depth_at(s, point.a, in_body_frame(motion, scene, point.a, beyond))[3] < 0.5 * spacing
+
+
+@wp.func
 def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
     """Sample q of body a at body b."""
     out = NearPoint()
@@ -93,6 +113,7 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
     out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
     x = in_body_frame(motion, scene, b, out.at)
     found = depth_at(s, b, x)
+    now = found[3]
     way = _way_of_a_step(motion, scene, a, b, out.at)
     if wp.length(way) > STEP_OF_A_CELL * s.spacing[b]:
         share = float(1.0)
@@ -110,11 +131,12 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
     own = motion.R[scene, a] * s.normals[a, q]
     out.facing = -wp.dot(own, out.normal) > MIN_FACING
     # Where b has an edge its depths increase in an oblique direction. The normal is that of a face: of faces that are
-    # parallel the one of the flatter surface, else that of a if its sample is on one.
+    # parallel the one of the flatter surface, else that of a if its sample is on one, unless that ends at a face of b.
     p = s.point[a, q]
     r = s.nearest[nearest_node(s, b, x)]
     most = float(-1.0)
     opposite = wp.vec3()
+    ends = bool(False)
     if r >= 0:
         to_b = wp.transpose(R) * motion.R[scene, a]
         for i in range(FACES):
@@ -125,8 +147,13 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
                     opposite = s.faces[r, j]
         if most > -1.0:
             out.facing = most > MIN_FACING
+        if most <= OPPOSED and s.flatness[p] > 0.0 and s.flatness[r] > 0.0:
+            ends = _ends_at_face(s, motion, scene, out, own, now, s.faces[r, 0])
     if most > OPPOSED and (s.flatness[p] == 0.0 or s.flatness[r] > s.flatness[p] + CURVED):
         out.normal = R * opposite
+    elif ends:
+        out.normal = R * s.faces[r, 0]
+        out.gap = s.overlap[a, b] - now
     elif s.flatness[p] > 0.0:
         out.normal = -own
     return out

@@ -80,15 +80,15 @@ def _states(
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.shape.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
+    placed, middle, first = keypoints.rest + setup.lift[row], com + setup.lift, torch.cat(world.pose(), 1)
     current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
         centre, quat = world.pose()
-        centre = centre / scene.metres_per_unit
+        moved = (torch.cat([centre, quat], 1) != first).any(1, keepdim=True)  # the others are without rounding
+        centre = torch.where(moved, centre / scene.metres_per_unit, middle)
         check_motion(torch.cat([centre, quat[:, 1:]]), frame, options)
-        if frame == 0:  # without rounding
-            yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat, world.mass)
-        else:
-            yield FrameState(centre[row] + (matrix(quat)[row] @ arm)[..., 0], centre, quat, world.mass)
+        positions = torch.where(moved[row], centre[row] + (matrix(quat)[row] @ arm)[..., 0], placed)
+        yield FrameState(positions, centre, quat, world.mass)
         if frame < options.steps - 1:
             active, changes = prompts.during(frame * options.dt, (frame + 1) * options.dt)
             if active is not acting:

@@ -240,6 +240,15 @@ def test_objects_of_photos_rest_until_something_disturbs_them(tmp_path):
     assert moved[2] == 0 and moved[0] > 0.2 and float(t.com[-1, 1, 2] - t.com[0, 1, 2]) < -0.05
 
 
+def test_what_does_not_move_is_written_without_rounding(tmp_path):
+    """So that it is rendered as it is, without being skinned and shaded; beside what moves, and lifted."""
+    prompts = {"velocity": ("object=1 0,1,0",), "lift": ("2=.1",), "pin": ("2",)}
+    t = roll(tmp_path, cube(0.1, 0.37, 0.0), cube(0.1, -0.71, 0.0), unit=0.3, steps=10, photos=True, **prompts)
+    still, lift = t.keypoints.object_id == 2, torch.tensor([0.0, 0.0, 0.1])
+    assert torch.equal(t.positions[:, still], (t.keypoints.rest[still] + lift).expand(10, -1, -1))
+    assert torch.equal(t.com[:, 1], t.com[:1, 1].expand(10, -1)) and float((t.com[-1, 0] - t.com[0, 0]).norm()) > 0.05
+
+
 def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
     """Photos show things at rest: the support is not seen. The upper cube falls once the one below it is taken away."""
     cubes = cube(0.1, 0.02, 0.15), cube(0.1, 0, 0.0), cube(0.1, -0.3, 0.15)

@@ -17,6 +17,7 @@ import logging
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -178,16 +179,26 @@ class _World:
         self.set_forces(prompts.forces, prompts.pinned)
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
-        lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
         self._cylinders = CylinderContacts(mujoco, self.model)
+        self._find_contacts = cache(partial(self._initial_contacts, setup, table, at_rest, options))
+        self._has_moved = False
+        if options.live:  # the first drag does not wait for them
+            self._find_contacts()
+        self.release(i for i in self._free if i not in at_rest)
+
+    def _initial_contacts(
+        self, setup: SceneSetup, table: TableOutline | None, at_rest: list[int], options: SimulateOptions
+    ) -> None:
+        """What touches what at the start, which only matters once something moves."""
+        lift = setup.lift.double().numpy()[self._free] * self.scene.metres_per_unit / self.units.length
         self._find_positions()
         self._overlaps = InitialOverlaps(self.model, self.data)
-        self._surfaces = self._surface_contacts(setup, options) if not all(b.shape.convex for b in bodies) else None
+        convex = all(b.shape.convex for b in self.bodies)
+        self._surfaces = None if convex else self._surface_contacts(setup, options)
         self._edges = None if table is None else self._table_edges(table)
         self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         self._resting = self._resting_bodies(setup, at_rest)
         self.data.qpos.reshape(-1, FREE)[:, :3] += lift
-        self.release(i for i in self._free if i not in at_rest)
 
     def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:
         """The forces from now on; those on pinned objects have no effect."""
@@ -279,7 +290,12 @@ class _World:
 
     def release(self, rows: Iterable[int]) -> None:
         """Let objects move that rested until now."""
-        released = self._resting.release(i + 1 for i in rows)
+        bodies = [i + 1 for i in rows]
+        if not bodies:
+            return
+        self._find_contacts()
+        self._has_moved = True
+        released = self._resting.release(bodies)
         if released:
             log.debug("moved from rest: %s", ", ".join(self.scene.objects[i - 1].name for i in released))
 
@@ -289,7 +305,7 @@ class _World:
         acting = [row for row in self._forces if row[0].active_fraction(time, time + self._dt) > 0]
         self.release(row for _, row, _ in acting)
         self.data.xfrc_applied[:] = 0
-        if self._resting.fixed.all():
+        if not self._has_moved or self._resting.fixed.all():
             return
         for n in range(self.substeps):
             if acting:

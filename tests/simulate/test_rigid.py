@@ -24,7 +24,9 @@ from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.lab.bench.experiments.bodies import compound
+from stages.simulate import rigid
 from stages.simulate.contact_forces import MAX_PASSES, REST_SPEED, set_references, solve
+from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.rigid_model import OMEGA, restitution
 from stages.simulate.stage import run
@@ -247,6 +249,17 @@ def test_what_does_not_move_is_written_without_rounding(tmp_path):
     still, lift = t.keypoints.object_id == 2, torch.tensor([0.0, 0.0, 0.1])
     assert torch.equal(t.positions[:, still], (t.keypoints.rest[still] + lift).expand(10, -1, -1))
     assert torch.equal(t.com[:, 1], t.com[:1, 1].expand(10, -1)) and float((t.com[-1, 0] - t.com[0, 0]).norm()) > 0.05
+
+
+def test_contacts_are_found_once_something_moves(tmp_path, monkeypatch):
+    found = []
+    monkeypatch.setattr(rigid, "InitialOverlaps", lambda *of: found.append(of) or InitialOverlaps(*of))
+    cubes = cube(0.1, 0, 0.0), cube(0.1, 0, 0.1)
+    roll(tmp_path, *cubes, steps=4, photos=True)
+    assert not found
+    t = roll(tmp_path, *cubes, steps=20, photos=True, force=("object=1 force=60,0,0 from=.1",))
+    assert len(found) == 1 and torch.equal(t.positions[5], t.positions[0])
+    assert float(t.com[-1, 0, 0] - t.com[0, 0, 0]) > 0.1 and float(t.com[-1, 1, 2] - t.com[0, 1, 2]) < -0.05
 
 
 def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):

@@ -352,11 +352,21 @@ def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.nda
     row = np.arange(len(x))
     key = 6 * pair + 2 * axis + (normal[row, axis] > 0)
     u, v = x[row, (axis + 1) % 3], x[row, (axis + 2) % 3]
-    kept = []
-    for score in (u, -u, v, -v, u + v, u - v, -u + v, -u - v, depth):
-        order = np.lexsort((score, key))
-        kept.append(order[np.append(key[order[1:]] != key[order[:-1]], True)] if len(x) else order)
-    return np.unique(np.concatenate(kept))
+    return largest_of_groups(np.stack([u, -u, v, -v, u + v, u - v, -u + v, -u - v, depth]), key)
+
+
+def largest_of_groups(values: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """Sorted columns of the largest of each row of values (s, n) in each group of equal keys (n,); of equal values the
+    last.
+    """
+    if not len(key):
+        return NONE[0]
+    order = key.argsort(kind="stable")
+    begins = np.diff(key[order], prepend=key.min() - 1) != 0
+    first, values = np.flatnonzero(begins), values[:, order]
+    largest = np.maximum.reduceat(values, first, axis=1)[:, begins.cumsum() - 1]
+    last = np.maximum.reduceat(np.where(values == largest, np.arange(len(key)), -1), first, axis=1)
+    return np.unique(order[last])
 
 
 def _frames(normal: np.ndarray) -> np.ndarray:

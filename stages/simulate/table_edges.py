@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.perception.table_outline import TableOutline
-from stages.simulate.surface_contacts import AddedContacts, add_contacts
+from stages.simulate.surface_contacts import AddedContacts, add_contacts, largest_of_groups
 
 ON_EDGE = 1e-9  # of the other edges, up to which a point is on the table [units of the simulation]
 
@@ -48,10 +48,11 @@ class TableEdges:
         contact.efc_address[rows] = -1  # which MuJoCo leaves undefined where it excludes all contacts
         over = self._on_table & ~self._left[1 : count + 1] & ~fixed[1 : count + 1]
         over &= (np.abs(beyond) < self._radius) & (centre[:, 2] - self._floor < self._radius)
-        found = [(i, x) for i in np.flatnonzero(over) for x in self._on_edges(self._low(data, i), self._sunk[i])]
-        if not found:
+        over = np.flatnonzero(over)
+        found = [self._on_edges(self._low(data, i), self._sunk[i]) for i in over]
+        i, x = np.repeat(over, [len(points) for points in found]), np.concatenate([np.zeros((0, 3)), *found])
+        if not len(x):
             return
-        i, x = np.array([i for i, _ in found]), np.array([x for _, x in found])
         depth = self._floor - x[:, 2] - self._sunk[i]
         up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
         geoms = np.stack([np.zeros(len(x), int), np.array(self._geom)[i]], 1)
@@ -68,20 +69,18 @@ class TableEdges:
         edges = edges[low[edges].any(1)] if low.any() else edges[:0]
         return corners[edges] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
 
-    def _on_edges(self, ends: np.ndarray, sunk: float) -> list[np.ndarray]:
-        """The outermost points at which edges (e, 2, 3) of a body cross edges of the table at a depth above `sunk`."""
-        found = []
+    def _on_edges(self, ends: np.ndarray, sunk: float) -> np.ndarray:
+        """The outermost points (n, 3) at which edges (e, 2, 3) of a body cross edges of the table at a depth above
+        `sunk`.
+        """
         side = ends[..., :2] @ self._outline.normals.T - self._outline.offsets  # (e, 2, k)
-        for k in np.flatnonzero((side < 0).any((0, 1)) & (side > 0).any((0, 1))):
-            crossing = side[:, 0, k] * side[:, 1, k] < 0
-            a, b = side[crossing, :, k].T
-            x = ends[crossing, 0] + (a / (a - b))[:, None] * (ends[crossing, 1] - ends[crossing, 0])
-            x = x[(x[:, 2] < self._floor - sunk) & (self._outline.beyond(x) < ON_EDGE)]
-            if len(x):
-                normal = self._outline.normals[k]
-                along = x[:, :2] @ [-normal[1], normal[0]]
-                found += [x[row] for row in {int(along.argmin()), int(along.argmax()), int(x[:, 2].argmin())}]
-        return found
+        of, row = np.nonzero((side[:, 0] * side[:, 1] < 0).T)  # edges of the table and of the body
+        a, b = side[row, 0, of], side[row, 1, of]
+        x = ends[row, 0] + (a / (a - b))[:, None] * (ends[row, 1] - ends[row, 0])
+        kept = (x[:, 2] < self._floor - sunk) & (self._outline.beyond(x) < ON_EDGE)
+        x, normal = x[kept], self._outline.normals[of[kept]]
+        along = x[:, 1] * normal[:, 0] - x[:, 0] * normal[:, 1]
+        return x[largest_of_groups(np.stack([-along, along, -x[:, 2]]), of[kept])]
 
 
 def _hull_edges(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | depth_lookup                  | Warp                        | `DepthLookup` in the file                            |
 | nearest_rotations             | Warp                        | `geometry.rotations.nearest_rotation`                |
 | sphere_shadows                | Warp                        | `blocked_light_reference` in the file                |
+| average_linkage               | C++ snippet                 | `average_linkage_reference` in the file              |
 | adam                          | PyTorch (CPU), Warp         | `torch.optim.Adam`                                   |
 | semi_global                   | PyTorch (CPU), CUDA snippet | `path_costs_reference` in the file                   |
 | splat/projection, harmonics   | C++ and CUDA snippets       | `projection.project_reference`                       |

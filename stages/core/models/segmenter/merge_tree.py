@@ -9,11 +9,13 @@ Sources: Bailoni et al. 2022, "GASP, a generalized framework for agglomerative c
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
+
+from stages.core.kernels.average_linkage import average_linkage
 
 
 @dataclass(frozen=True)
@@ -112,34 +114,9 @@ def merge_tree(count: int, pairs: np.ndarray, weights: np.ndarray) -> MergeTree:
 
     The two nodes with the largest mean weight between them merge first; parts without an edge between them stay apart.
     """
-    links: list[dict[int, tuple[float, int]] | None] = [{} for _ in range(count)]
     low, high = pairs.min(1), pairs.max(1)
     keys, at = np.unique(low * count + high, return_inverse=True)
-    total, number = np.bincount(at, weights), np.bincount(at)
-    for key, w, n in zip(keys.tolist(), total.tolist(), number.tolist(), strict=True):
-        a, b = divmod(key, count)
-        if a != b:
-            links[a][b] = links[b][a] = (w, n)
-    queue = [(-w / n, a, b) for a, row in enumerate(links) for b, (w, n) in row.items() if a < b]
-    heapq.heapify(queue)
-    node, merges = list(range(count)), []  # node[i]: what stands in slot i
-    while queue:
-        value, a, b = heapq.heappop(queue)
-        found = links[a].get(b) if links[a] is not None and links[b] is not None else None
-        if found is None or -found[0] / found[1] != value:  # merged, or changed since it was queued
-            continue
-        if len(links[a]) < len(links[b]):
-            a, b = b, a
-        merges.append((node[a], node[b], *found))
-        node[a] = count + len(merges) - 1
-        mine, theirs = links[a], links[b]
-        links[b] = None
-        del mine[b], theirs[a]
-        for other, (w, n) in theirs.items():
-            old = mine.get(other)
-            new = (w, n) if old is None else (w + old[0], n + old[1])
-            mine[other] = links[other][a] = new
-            del links[other][b]
-            heapq.heappush(queue, (-new[0] / new[1], min(a, other), max(a, other)))
-    table = np.array(merges, dtype=np.float64).reshape(-1, 4)
-    return MergeTree(count, table[:, :2].astype(np.int64), table[:, 2], table[:, 3])
+    ends = np.stack(np.divmod(keys, max(count, 1)), 1)
+    apart = ends[:, 0] != ends[:, 1]
+    edges = (x[apart] for x in (ends, np.bincount(at, weights), np.bincount(at)))
+    return MergeTree(count, *(x.numpy() for x in average_linkage(count, *map(torch.from_numpy, edges))))

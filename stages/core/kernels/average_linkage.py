@@ -13,7 +13,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.kernels.interop import device_of, kernel_device, launch, view, with_arrays
+from stages.core.kernels.interop import compiles_for_cpu, launch, view, with_arrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -124,22 +124,21 @@ def average_linkage(
     """The merges of that many clusters: the two nodes of each, and the sum and the number of the weights between them.
 
     Edges `ends`, each once and no loop, have the sums of so many weights. The two clusters with the largest mean merge
-    first; merge k makes node clusters + k.
+    first; merge k makes node clusters + k. All tensors are on the CPU, as it is one thread's work.
     """
-    device = kernel_device(ends)
+    if not compiles_for_cpu():
+        return average_linkage_reference(clusters, ends, sums, numbers)
     edges = {"ends": ends.int(), "sum": sums.double(), "number": numbers.int()}
-    edges = {name: x.to(device, copy=True).contiguous() for name, x in edges.items()}
+    edges = {name: x.clone(memory_format=torch.contiguous_format) for name, x in edges.items()}
     sizes = {"heap": 1, "place": 1, "next": 2}
-    room = {name: torch.empty(k * len(ends), dtype=torch.int32, device=device) for name, k in sizes.items()}
-    room |= {name: torch.empty(clusters, dtype=torch.int32, device=device)
-             for name in ("first", "degree", "node", "edge_to")}  # fmt: skip
+    room = {name: torch.empty(k * len(ends), dtype=torch.int32) for name, k in sizes.items()}
+    room |= {name: torch.empty(clusters, dtype=torch.int32) for name in ("first", "degree", "node", "edge_to")}
     graph = with_arrays(ClusterGraph(), {**edges, **room, "mean": torch.empty_like(edges["sum"])})
-    children, merged, count = (torch.empty(shape, dtype=torch.int32, device=device)
+    children, merged, count = (torch.empty(shape, dtype=torch.int32)
                                for shape in ((max(clusters, 1), 2), max(clusters, 1), 1))  # fmt: skip
-    launch(_merge, 1, [graph, *map(view, (children, merged, count))], device=device_of(count))
-    made = int(count)
-    merged = merged[:made].long()
-    return (children[:made].long().cpu(), edges["sum"][merged].cpu(), edges["number"][merged].long().cpu())
+    launch(_merge, 1, [graph, *map(view, (children, merged, count))])
+    merged = merged[: int(count)].long()
+    return children[: int(count)].long(), edges["sum"][merged], edges["number"][merged].long()
 
 
 def average_linkage_reference(

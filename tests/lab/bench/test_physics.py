@@ -9,7 +9,7 @@ import pytest
 from stages.core.errors import InputError
 from stages.core.physics import solid_surface
 from stages.lab.bench.experiments.catalogue import experiments
-from stages.lab.bench.experiments.friction import leaning_angle
+from stages.lab.bench.experiments.friction import ladder_angle, leaning_angle
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import chosen, measure, run
 from stages.simulate.options import QUALITIES, MpmQuality
@@ -61,6 +61,14 @@ def test_a_slightly_leaning_block_turns_as_a_linear_pendulum_upside_down():
     slender, p = math.atan2(0.01, 1.0), math.sqrt(0.75 * 9.81 / (math.hypot(0.01, 1.0) / 2))
     expected = slender - (slender - 0.005) * math.cosh(0.2 * p)
     assert leaning_angle(0.01, 1.0, 0.005, 0.2) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_thin_ladder_slides_as_a_rod():
+    """angle'' = -3 g / (2 length) cos(angle), of which the first integral is rate^2 = 3 g (sin(start) - sin(angle))."""
+    time, dt = 0.2, 1e-5
+    angle = [ladder_angle(1.0, 0.0, 1.0, t) for t in (time - dt, time + dt)]
+    rate = (angle[1] - angle[0]) / (2 * dt)
+    assert rate**2 == pytest.approx(3 * 9.81 * (math.sin(1.0) - math.sin(sum(angle) / 2)), rel=1e-3)
 
 
 def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):

@@ -74,6 +74,32 @@ def bowl(inner: float, outer: float) -> Surface:
     return Surface(points + centre, normals)
 
 
+def cylinder(radius: float, length: float, spacing: float) -> Surface:
+    """A solid cylinder around the y axis, its middle at the origin."""
+    around = torch.arange(0, 2 * math.pi, spacing / radius)
+    a, y = torch.cartesian_prod(around, torch.linspace(-length / 2, length / 2, round(length / spacing) + 1)).T
+    out = torch.stack([a.cos(), torch.zeros_like(a), a.sin()], 1)
+    points, normals = [radius * out + y[:, None] * torch.tensor([0.0, 1.0, 0.0])], [out]
+    for r in torch.arange(spacing / 2, radius, spacing).tolist():
+        a = torch.arange(0, 2 * math.pi, spacing / r)
+        for side in (-1.0, 1.0):
+            end = torch.full_like(a, side)
+            points.append(torch.stack([r * a.cos(), length / 2 * end, r * a.sin()], 1))
+            normals.append(torch.stack([torch.zeros_like(a), end, torch.zeros_like(a)], 1))
+    return Surface(torch.cat(points), torch.cat(normals))
+
+
+def wedge(length: float, width: float, degrees: float, spacing: float) -> Surface:
+    """A right-angled wedge on z = 0 around the z axis, whose upper face falls towards +x at this angle."""
+    height = length * math.tan(math.radians(degrees))
+    block = box((length, width, height), spacing).moved((0, 0, height / 2))
+    below = block.points[:, 2] < height * (0.5 - block.points[:, 0] / length)
+    block = block.kept(below & (block.normals[:, 0] < 0.5) & (block.normals[:, 2] < 0.5))
+    slope = tilted(box((math.hypot(length, height), width, height), spacing).moved((0, 0, -height / 2)), degrees)
+    slope = slope.kept(slope.normals[:, 2] > math.cos(math.radians(degrees)) - 1e-3).moved((0, 0, height / 2))
+    return Surface(torch.cat([block.points, slope.points]), torch.cat([block.normals, slope.normals]))
+
+
 def compound(spacing: float, *boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Surface:
     """The union of upright boxes of these sides and centres [m]."""
 

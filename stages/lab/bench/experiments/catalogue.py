@@ -5,7 +5,17 @@ from functools import cache
 from types import MappingProxyType
 
 from stages.lab.bench.experiments.experiment import Experiment
-from stages.lab.bench.experiments.friction import compound_slides, creep, rocking, rolls, slides, slopes
+from stages.lab.bench.experiments.friction import (
+    compound_slides,
+    creep,
+    ladders,
+    levers,
+    rocking,
+    rolls,
+    slides,
+    slopes,
+    wedges,
+)
 from stages.lab.bench.experiments.impacts import bounces, collisions, falls, invariance, rebounds, torques
 from stages.lab.bench.experiments.stacks import boxes, piles, stacks, towers
 
@@ -13,6 +23,6 @@ from stages.lab.bench.experiments.stacks import boxes, piles, stacks, towers
 @cache
 def experiments() -> Mapping[str, Experiment]:
     """All experiments by name."""
-    groups = (slides, compound_slides, slopes, rolls, rocking, creep, falls, torques, towers, invariance,
-              collisions, rebounds, bounces, stacks, piles, boxes)  # fmt: skip
+    groups = (slides, compound_slides, wedges, slopes, rolls, rocking, ladders, levers, creep, falls, torques, towers,
+              invariance, collisions, rebounds, bounces, stacks, piles, boxes)  # fmt: skip
     return MappingProxyType({e.name: e for group in groups for e in group()})

@@ -9,7 +9,17 @@ from itertools import product
 
 from stages.core.scene.trajectory import Trajectory
 from stages.lab.assets.shapes import box, ellipsoid
-from stages.lab.bench.experiments.bodies import Run, Specimen, about_z, block, compound, on_slope, tilted
+from stages.lab.bench.experiments.bodies import (
+    Run,
+    Specimen,
+    about_z,
+    block,
+    compound,
+    cylinder,
+    on_slope,
+    tilted,
+    wedge,
+)
 from stages.lab.bench.experiments.experiment import SLIDES, TOLERANCES, Experiment, G
 from stages.lab.bench.experiments.measures import path
 
@@ -112,6 +122,79 @@ def leaning_angle(width: float, height: float, start: float, time: float) -> flo
         rate -= dt * (0.5 if k == 0 else 1) * 0.75 * G / half_diagonal * math.sin(slenderness - angle)
         angle += dt * rate
     return angle
+
+
+def wedges() -> Iterator[Experiment]:
+    """A block on a wedge of its mass that slides on the floor, all without friction."""
+    degrees, length, width, side, time = 30.0, 0.4, 0.2, 0.16, 0.25
+    below, block = wedge(length, width, degrees, 0.01), box((side,) * 3, 0.01).moved((0, 0, side / 2))
+    block = tilted(block.moved((-0.08, 0, 0)), degrees).moved((0, 0, length / 2 * math.tan(math.radians(degrees))))
+    heavy = length**2 * math.tan(math.radians(degrees)) / 2 * width  # volume of the wedge
+    run = Run((Specimen(below), Specimen(block, density=540.0 * heavy / side**3)),
+              {"friction": 0.0, "dt": 0.01, "steps": 26})  # fmt: skip
+    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    value = G * sine * cosine / (1 + sine**2) * time**2 / 2
+    yield Experiment("slide/block on a loose wedge", (run,), lambda t: float(-path(t, 0)[-1, 0]), value,
+                     "way of the wedge in .25 s [m]", value, SLIDES)  # fmt: skip
+
+
+def ladders() -> Iterator[Experiment]:
+    """A ladder between a wall and a floor without friction, until it has turned by 21 degrees; it leaves them later."""
+    length, thick, spacing, start, time = 1.0, 0.06, 0.01, 60.0, 0.3
+    ladder = tilted(box((length, 0.2, thick), spacing), start)
+    low = ladder.points.amin(0).tolist()
+    wall = box((0.1, 0.6, 1.2), 0.03).moved((-0.05, 0, 0.6))
+    run = Run((Specimen(wall), Specimen(ladder.moved((-low[0], 0, -low[2])))),
+              {"pin": ("1",), "friction": 0.0, "dt": 0.01, "steps": 31})  # fmt: skip
+    left = ladder_angle(
+        length - spacing, thick - spacing, math.radians(start), time
+    )  # the faces end half a spacing inside
+
+    def turned(t: Trajectory) -> float:
+        return math.degrees(abs(2 * math.atan2(*t.rotation[-1, 1, [2, 0]].tolist())))
+
+    yield Experiment("lean/ladder", (run,), turned, start - math.degrees(left), "turned in .3 s [degrees]",
+                     start - math.degrees(left), TOLERANCES)  # fmt: skip
+
+
+def ladder_angle(length: float, thick: float, start: float, time: float) -> float:
+    """Angle [rad] of a board that leans on a wall, `time` [s] after it was let go at the angle `start`, while the edges
+    of its lower side touch wall and floor without friction.
+
+    Lagrange's equation for a kilogram of it, whose middle is at x, z (derivatives by the angle):
+    (I + x'^2 + z'^2) angle'' = -g z' - (x' x'' + z' z'') angle'^2; integrated by small steps.
+    """
+    steps = 10_000
+    dt, angle, rate = time / steps, start, 0.0
+    for _ in range(steps):
+        sine, cosine = math.sin(angle), math.cos(angle)
+        x1, z1 = (thick * cosine - length * sine) / 2, (length * cosine - thick * sine) / 2
+        x2, z2 = -(thick * sine + length * cosine) / 2, -(length * sine + thick * cosine) / 2
+        inertia = (length**2 + thick**2) / 12 + x1**2 + z1**2
+        rate -= dt * (G * z1 + (x1 * x2 + z1 * z2) * rate**2) / inertia
+        angle += dt * rate
+    return angle
+
+
+def levers() -> Iterator[Experiment]:
+    """A board on a fixed round bar, with a block on each arm, the right one of twice the mass of the left one."""
+    radius, length, thick, side, arm, time = 0.15, 1.2, 0.03, 0.08, 0.4, 0.15
+    top = 0.4 + radius
+    board = box((length, 0.2, thick), 0.005).moved((0, 0, top + thick / 2))
+    blocks = [(box((side,) * 3, 0.004).moved((x, 0, top + thick + side / 2)), rho)
+              for x, rho in ((-arm, 1000.0), (arm, 2000.0))]  # fmt: skip
+    run = Run((Specimen(cylinder(radius, 0.3, 0.0125).moved((0, 0, 0.4))), Specimen(board),
+               *(Specimen(b, density=rho) for b, rho in blocks)),
+              {"pin": ("1",), "friction": 0.8, "dt": 0.01, "steps": 16})  # fmt: skip
+    mass, light = 540.0 * length * 0.2 * thick, 1000.0 * side**3
+    up = thick + side / 2
+    inertia = mass * (length**2 / 12 + thick**2 / 3) + 3 * light * (side**2 / 6 + arm**2 + up**2)  # about the contact
+    value = math.degrees(light * arm * G / inertia * time**2 / 2)
+
+    def turned(t: Trajectory) -> float:
+        return math.degrees(2 * math.atan2(*t.rotation[-1, 1, [2, 0]].tolist()))
+
+    yield Experiment("lean/see-saw", (run,), turned, value, "angle after .15 s [degrees]", value, TOLERANCES)
 
 
 def creep() -> Iterator[Experiment]:

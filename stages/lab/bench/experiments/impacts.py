@@ -74,6 +74,10 @@ def collisions() -> Iterator[Experiment]:
     e = math.exp(-math.pi * 0.15 / 2)
     yield Experiment("collision/restitution", (pair,), lambda t: float(speeds(t) @ torch.tensor([-1.0, 1.0])), e,
                      "speed of separation, 1 of approach", 1.0, TOLERANCES)  # fmt: skip
+    row = tuple(ball(0.1, (0.2 * i - 0.1 * (i == 0), 0, 0.1)) for i in range(5))
+    hit = Run(row, {"friction": 0.0, "velocity": ("object=1 1,0,0",), "dt": 0.01, "steps": 41})
+    yield Experiment("collision/row of five", (hit,), lambda t: float(path(t, 4)[-1, 0] - path(t, 4)[-6, 0]) / 0.05,
+                     ((1 + e) / 2) ** 4, "speed of the last one, 1 of the first", 1.0, TOLERANCES)  # fmt: skip
     still = Run((cube(0.3, bottom=0.5), cube(0.3, 0.5, 0.5)), {"gravity": 0.0})
     yield Experiment("free space/two at rest", (still,), lambda t: largest_shift(t) / 0.3, 0.0, "largest shift [sides]",
                      1.0, TOLERANCES)  # fmt: skip

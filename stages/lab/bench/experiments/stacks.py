@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import product
 
 import torch
 
-from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, bowl, cube
+from stages.lab.assets.shapes import box
+from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, bowl, cube, cylinder
 from stages.lab.bench.experiments.experiment import GAPS, TOLERANCES, Experiment
-from stages.lab.bench.experiments.measures import gap, largest_shift, overlap
+from stages.lab.bench.experiments.measures import gap, largest_shift, overlap, path
 
 
 def towers() -> Iterator[Experiment]:
@@ -26,6 +28,10 @@ def stacks() -> Iterator[Experiment]:
     soft = (cube(0.3, E=1e5, density=100.0), cube(0.15, bottom=0.31, E=1e9, density=2700.0))
     small = (cube(0.5), cube(0.05, bottom=0.505))
     rod = (cube(0.2, -0.3), cube(0.2, 0.3), block((1.0, 0.1, 0.1), (0, 0, 0.26)))
+    card = (Specimen(box((0.09, 0.06, 0.002), 0.002).moved((0, 0, 0.001))), cube(0.12, 0.02, 0.002, density=2900.0))
+    on_card = Run(card, {"steps": 50, "lift": ("2=.01",)})
+    yield Experiment("stack/box on a card", (on_card,), lambda t: float(path(t, 1)[-1, 2] + 0.01) / 0.002, 0.0,
+                     "height above it [cards of 2 mm]", 1.0, dict.fromkeys(TOLERANCES, 0.1))  # fmt: skip
     yield Experiment("stack/heavy on soft", (Run(soft),), gap, 0.0, "gap [heights]", 1.0, GAPS)
     yield Experiment("stack/size 1:10", (Run(small),), gap, 0.0, "gap [heights]", 1.0, GAPS)
     yield Experiment("stack/rod on two boxes", (Run(rod),), lambda t: gap(t, 3, 1), 0.0, "gap [heights]", 1.0, GAPS)
@@ -36,6 +42,11 @@ def piles() -> Iterator[Experiment]:
     inside = Run((Specimen(bowl(0.25, 0.3), E=1e7), ball(0.08, (0.0, 0.0, 0.14), loss=0.4)), {"steps": 150})
     yield Experiment("pile/ball in a bowl", (inside,), lambda t: float(t.com[-1, 1, 2]) / 0.08, 0.13 / 0.08,
                      "height of its middle [radii]", 1.0, TOLERANCES)  # fmt: skip
+    places = ((-0.1, 0.1), (0.1, 0.1), (0.0, 0.1 + 0.1 * math.sqrt(3)))
+    logs = tuple(Specimen(cylinder(0.1, 0.3, 0.01).moved((x, 0, z)), loss=0.02) for x, z in places)
+    # forces between logs act at 15 degrees to the normal, of which the tangent is .268
+    yield Experiment("pile/three logs", (Run(logs, {"friction": 0.3}),), lambda t: float(-path(t, 2)[-1, 2]) / 0.1, 0.0,
+                     "fall of the upper one in 2 s [radii]", 1.0, TOLERANCES)  # fmt: skip
     for count in (20, 40):
         random = torch.Generator().manual_seed(count)
         places = torch.cartesian_prod(torch.arange(2.0), torch.arange(2.0), torch.arange(count / 4))

@@ -13,7 +13,7 @@ from torch import Tensor
 from stages.core.models.field.body_surfaces import BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper
-from stages.simulate.resting_bodies import SUPPORT_COSINE, SUPPORT_GAP, Stance, excess_force, highest_below
+from stages.simulate.resting_bodies import SUPPORT_COSINE, SUPPORT_GAP, Stance, excess_force, highest_below, leans
 
 RELEASE_FALL = 0.005  # bodies are released once they would have the speed after this fall [sizes of the smallest one]
 
@@ -75,24 +75,34 @@ def _stance(surfaces: BodySurfaces, row: int, com: Float[Tensor, "3"], friction:
     at = surfaces.samples[row, surfaces.near[row] >= 0]
     low, high = (com + corner for corner in (at.amin(0), at.amax(0)))
     half_width = float((high - low)[:2].min()) / 2
-    return Stance(friction, max(float(-at[:, 2].min()), 1e-6), half_width, standing, low.numpy(), high.numpy())
+    height, leaning = max(float(-at[:, 2].min()), 1e-6), leans(at.numpy(), np.zeros(3))
+    return Stance(friction, height, half_width, standing, low.numpy(), high.numpy(), leaning)
 
 
 def _supports(
     surfaces: BodySurfaces, com: Float[Tensor, "o 3"], stances: list[Stance], gap: float
 ) -> Bool[Tensor, "o o"]:
-    """Whether each body rests on each other one: not on the floor but on its upper side, at most `gap` [m] away."""
+    """Whether each body rests on each other one: not on the floor but on its upper side, at most `gap` [m] away, or
+    leaning, on any side.
+    """
     o, k, _ = surfaces.samples.shape
     at, real = com[:, None] + surfaces.samples, surfaces.near >= 0
-    out = torch.zeros(o, o, dtype=torch.bool)
+    out, beside = torch.zeros(2, o, o, dtype=torch.bool)
     for b in range(o):
         depth, slope = surfaces.look_up(torch.full((o * k,), b), (at - com[b]).flatten(0, 1))
         touching = (depth.view(o, k) > -gap) & real
         up = -slope[:, 2].view(o, k)
         out[:, b] |= (touching & (up > SUPPORT_COSINE)).any(1)
         out[b] |= (touching & (up < -SUPPORT_COSINE)).any(1)
+        beside[:, b] |= (level := (touching & (up.abs() <= SUPPORT_COSINE)).any(1))
+        beside[b] |= level
+    for row, stance in enumerate(stances):
+        if stance.leaning:
+            out[row] |= beside[row]
     out.fill_diagonal_(False)
     for row, stance in enumerate(stances):
+        if stance.leaning and bool(out[row].any()):
+            continue
         if stance.on_floor:
             out[row] = False
         elif not bool(out[row].any()) and (lower := highest_below(stances, row)) is not None:

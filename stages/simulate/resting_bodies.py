@@ -1,9 +1,9 @@
 """Rigid bodies that are at rest in photos, and held until their equilibrium is disturbed.
 
 Photos show a static equilibrium, but not all that keeps it: undersides, the relief of the table and things that are
-no objects are missing. So every body is held until one that it rests on is released (where it touches none: the
-highest one below it), until a user acts on it, or until contact forces exceed what weight and friction can resist: a
-force F slides a body of mass m when |Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its
+no objects are missing. So every body is held until one that it rests or leans on is released (where it touches none:
+the highest one below it), until a user acts on it, or until contact forces exceed what weight and friction can resist:
+a force F slides a body of mass m when |Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its
 moment about the base exceeds (m g - Fz) times half the shorter side. The excess must last until it would have given
 the body the speed RELEASE_SPEED. Held bodies are so heavy that contacts do not move them, and do not collide with
 each other.
@@ -20,6 +20,8 @@ HELD_MASS = 1e6  # added inertia of a held body, relative to its own or the medi
 RELEASE_SPEED = 0.1  # [units]; that after a fall of 0.5 % of the smallest object
 SUPPORT_GAP = 0.05  # gap up to which a body supports another, as photos show little of contact regions [units]
 SUPPORT_COSINE = 0.5  # least upward component of the normal of a contact that supports
+BASE = 0.1  # height up to which points are the base of a body, as undersides are ragged [its height]
+BEYOND = 0.02  # distance beyond its base from which on the centre of mass of a body that leans is [its height]
 FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
 
 
@@ -33,6 +35,7 @@ class Stance:
     on_floor: bool
     low: np.ndarray  # (3,), lower corner of the bounds
     high: np.ndarray  # (3,), upper corner
+    leaning: bool = False  # it would fall over if nothing beside it held it
 
 
 class RestingBodies:
@@ -126,14 +129,29 @@ def excess_force(
     return np.maximum(excess, -load)
 
 
+def leans(points: np.ndarray, com: np.ndarray) -> bool:
+    """Whether a body with these points (n, 3) of its surface and this centre of mass (3,) is not above its base."""
+    height = np.ptp(points[:, 2])
+    base = points[points[:, 2] < points[:, 2].min() + BASE * height, :2]
+    way = com[:2] - base.mean(0)
+    return bool(((com[:2] - base) @ way).min() > BEYOND * height * np.linalg.norm(way))
+
+
 def _supports(stances: list[Stance], pairs: np.ndarray, upwards: np.ndarray) -> dict[int, set[int]]:
-    """Body -> the bodies that rest on it: in contact from above and not on the floor, or without contact over it."""
+    """Body -> the bodies that rest on it: in contact from above and not on the floor, in any contact and leaning, or
+    without contact over it.
+    """
     found: dict[int, set[int]] = {}
     of = np.where(pairs > len(stances), 0, pairs)  # others are fixed, as the world
     for pair, up in zip(of, upwards, strict=True):
-        lower, upper = pair if up > 0 else pair[::-1]
-        if lower > 0 and upper > 0 and abs(up) > SUPPORT_COSINE and not stances[upper - 1].on_floor:
-            found.setdefault(int(lower), set()).add(int(upper))
+        lower, upper = map(int, pair if up > 0 else pair[::-1])
+        if lower == 0 or upper == 0:
+            continue
+        steep = abs(up) > SUPPORT_COSINE
+        if stances[upper - 1].leaning or (steep and not stances[upper - 1].on_floor):
+            found.setdefault(lower, set()).add(upper)
+        if stances[lower - 1].leaning and not steep:
+            found.setdefault(upper, set()).add(lower)
     supported = set().union(*found.values())
     for i, s in enumerate(stances):
         if not s.on_floor and i + 1 not in supported and (lower := highest_below(stances, i)) is not None:

@@ -41,7 +41,7 @@ from stages.simulate.cylinder_contacts import CylinderContacts
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
-from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
+from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance, leans
 from stages.simulate.rigid_model import SUBSTEPS, Body, Units, mujoco_model, restitution
 from stages.simulate.setup import (
     SceneSetup,
@@ -273,7 +273,8 @@ class _World:
             start = b.start.double().numpy() / self.units.length - lift[i] - b.shape.com.double().numpy() * unit
             low, high = (start + corner.numpy() for corner in (points.amin(0), points.amax(0)))
             on_floor = bool(setup.on_floor_as_seen[i]) or float(low[2]) - setup.box.low[2] * unit < ON_FLOOR
-            stances.append(Stance(b.friction, height, float((high - low)[:2].min()) / 2, on_floor, low, high))
+            half_width, leaning = float((high - low)[:2].min()) / 2, leans(points.numpy(), b.shape.com.numpy() * unit)
+            stances.append(Stance(b.friction, height, half_width, on_floor, low, high, leaning))
         resting = RestingBodies(self.model, stances, *touching, [i + 1 for i in at_rest])
         self.model.geom_margin[:] = 0
         return resting

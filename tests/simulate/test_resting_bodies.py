@@ -1,11 +1,12 @@
 """Bodies at rest in photos: what slides, lifts and tips them, and what falls with what is taken away."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stages.simulate.resting_bodies import RELEASE_SPEED, RestingBodies, Stance
+from stages.simulate.resting_bodies import RELEASE_SPEED, RestingBodies, Stance, leans
 
 mujoco = pytest.importorskip("mujoco")
 MASS, G, STEP = 2.0, 9.81, 0.01
@@ -102,6 +103,25 @@ def test_what_rests_on_a_released_body_is_released_with_it():
     assert resting.release([2]) == [] and sorted(resting.release([3])) == [3]
     _, _, resting = world([*tower[::-1], beside])
     assert resting.resting_on == {1: {2}, 2: {3}} and sorted(resting.release([1])) == [1, 2, 3]
+
+
+def test_what_leans_on_a_released_body_is_released_with_it():
+    """Three boxes beside each other on the floor, of which the middle one leans, or the last two on each other."""
+    boxes = [(0.0, 0, 0.1, 0.1), (0.205, 0, 0.1, 0.1), (0.41, 0, 0.1, 0.1)]
+    stances = [stance(0.5, 0.1, 0.1, b) for b in boxes]
+    _, _, resting = world(boxes, [stances[0], replace(stances[1], leaning=True), stances[2]])
+    assert resting.resting_on == {1: {2}, 3: {2}} and sorted(resting.release([3])) == [2, 3]
+    _, _, resting = world(boxes, [stances[0], *(replace(s, leaning=True) for s in stances[1:])])
+    assert sorted(resting.release([3])) == [2, 3] and sorted(resting.release([1])) == [1]
+
+
+@pytest.mark.parametrize(("degrees", "leaning"), [(0, False), (20, True), (50, True), (80, True), (90, False)])
+def test_a_board_leans_unless_it_stands_or_lies(degrees, leaning):
+    """Of .5 x .15 x .06, turned by these degrees from where it lies: on its end it stands."""
+    x, y, z = np.meshgrid(*(np.array([-0.5, 0.5]) * side for side in (0.5, 0.15, 0.06)))
+    corners, a = np.stack([x, y, z], -1).reshape(-1, 3), math.radians(degrees)
+    turn = np.array([[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]])
+    assert leans(corners @ turn.T + 3.0, np.full(3, 3.0)) == leaning
 
 
 def test_what_touches_nothing_rests_on_the_highest_body_below_it():

@@ -23,7 +23,7 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
-from stages.lab.bench.experiments.bodies import compound
+from stages.lab.bench.experiments.bodies import compound, tilted
 from stages.simulate import rigid
 from stages.simulate.contact_forces import MAX_PASSES, REST_SPEED, set_references, solve
 from stages.simulate.initial_overlaps import InitialOverlaps
@@ -271,6 +271,15 @@ def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
     assert abs(float(t.com[-1, 0, 2] - t.com[0, 0, 2]) + 0.15) < 0.01
     hit = roll(tmp_path, *cubes, steps=40, photos=True, velocity=("object=3 4,0,0",))
     assert float(hit.com[:, 0, 2].min() - hit.com[0, 0, 2]) < -0.1
+
+
+@pytest.mark.parametrize(("lift", "falls"), [((), False), (("1=2",), True)])
+def test_a_board_that_leans_on_an_object_in_photos_falls_once_that_is_taken_away(tmp_path, lift, falls):
+    board = tilted(box((0.4, 0.1, 0.04), 0.01), 50)
+    low = board.points.amin(0)
+    board = board.moved((0.1 - float(low[0]), 0.0, -float(low[2])))
+    t = roll(tmp_path, box((0.2, 0.2, 0.4), 0.0125).moved((0.0, 0.0, 0.2)), board, photos=True, lift=lift, steps=21)
+    assert (float(t.com[0, 1, 2] - t.com[-1, 1, 2]) > 0.03) == falls
 
 
 def test_objects_of_films_and_with_no_rest_fall_from_where_they_are(tmp_path):

@@ -11,6 +11,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import quaternion
 from stages.core.kernels.nearest_rotations import nearest_rotations
 from stages.core.kernels.skinning import KeypointMotion, skin_gaussians
+from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
 
@@ -23,31 +24,46 @@ class Skinning:
 
     def __init__(self, gaussians: Gaussians, binding: Binding, keypoints: Keypoints):
         device = gaussians.means.device  # everything a frame needs; binding and keypoints stay on their own
-        self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous().to(device)
+        self.gaussians, self._deformation = gaussians, keypoint_deformation(keypoints, device)
         moving = (binding.index >= 0).any(1).nonzero()[:, 0]
         self._binding = Binding(binding.index[moving].int().to(device), binding.weight[moving].float().to(device))
         self._moving = moving.to(device)
         self._part = gaussians[self._moving]
-        self._neighbours_of = keypoint_neighbours(keypoints).to(device)
-        d = self.rest[self._neighbours_of] - self.rest[:, None]
-        a = 1 / (d.square().sum(-1) + 1e-12 + d.square().sum(-1).mean(1, keepdim=True))
-        a[self._neighbours_of == torch.arange(len(d), device=device)[:, None]] = 0  # padding with the keypoint itself
-        self._d, self._ad = d, a[..., None] * d
-        self._M = self._ad.mT @ d  # (p, 3, 3) sum a d d^T
-        self._ridge = RIDGE / 3 * self._M.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-12)
-        self._inverse = torch.linalg.inv(self._M.double() + self._ridge * torch.eye(3, device=device)).float()
-        _, self._body = keypoints.object_id.to(device).unique(return_inverse=True)
 
     def __call__(self, positions: Float[Tensor, "p 3"]) -> Gaussians:
         """The Gaussians for these keypoint positions [scene units]."""
         g, part = self.gaussians, self._part
-        u = positions.to(self.rest) - self.rest
-        if not len(self._moving) or not bool(u.any()):
+        motion = self._deformation.of(positions) if len(self._moving) else None
+        if motion is None:
             return g
-        means, quats, scales, R = skin_gaussians(self._binding, KeypointMotion(self.rest, u, self._gradients(u)), part)
+        means, quats, scales, R = skin_gaussians(self._binding, motion, part)
         moved = {"means": means, "quats": quats, "scales": scales, "sh": _rotate_sh(part.sh, R)}
         whole = {name: getattr(g, name).index_copy(0, self._moving, value) for name, value in moved.items()}
         return Gaussians(**whole, opacities=g.opacities, object_id=g.object_id)
+
+
+class KeypointDeformation:
+    """Displacements of keypoints and their gradients; of the last positions known, since several things follow them."""
+
+    def __init__(self, keypoints: Keypoints, device: torch.device):
+        self.rest = keypoints.rest.float().contiguous().to(device)
+        self._neighbours_of = keypoint_neighbours(keypoints).to(device)
+        d = self.rest[self._neighbours_of] - self.rest[:, None]
+        a = 1 / (d.square().sum(-1) + 1e-12 + d.square().sum(-1).mean(1, keepdim=True))
+        a[self._neighbours_of == torch.arange(len(d), device=device)[:, None]] = 0  # padding with the keypoint itself
+        self._ad = a[..., None] * d
+        self._M = self._ad.mT @ d  # (p, 3, 3) sum a d d^T
+        self._ridge = RIDGE / 3 * self._M.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-12)
+        self._inverse = torch.linalg.inv(self._M.double() + self._ridge * torch.eye(3, device=device)).float()
+        _, self._body = keypoints.object_id.to(device).unique(return_inverse=True)
+        self._last: tuple[Tensor, KeypointMotion | None] | None = None  # displacements, and what follows from them
+
+    def of(self, positions: Float[Tensor, "p 3"]) -> KeypointMotion | None:
+        """The motion to these positions [scene units]; None where all are at rest."""
+        u = positions.to(self.rest) - self.rest
+        if self._last is None or not torch.equal(self._last[0], u):
+            self._last = u, KeypointMotion(self.rest, u, self._gradients(u)) if bool(u.any()) else None
+        return self._last[1]
 
     def _gradients(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3 3"]:
         """Displacement gradient at each keypoint: weighted least squares over its neighbours, with a ridge.
@@ -68,6 +84,12 @@ class Skinning:
 
     def _object_rotations(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "o 3 3"]:
         return fit_rotations(self.rest, self.rest + u, self._body)
+
+
+@cached_in_scene
+def keypoint_deformation(keypoints: Keypoints, device: torch.device) -> KeypointDeformation:
+    """Those of keypoints, prepared once for each device."""
+    return KeypointDeformation(keypoints, device)
 
 
 def fit_rotations(

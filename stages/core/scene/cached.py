@@ -14,7 +14,7 @@ class Results(dict):
 
 
 def cached_in_scene(function: Callable) -> Callable:
-    """A deterministic function of a scene and of hashable arguments that computes each result once.
+    """A deterministic function of a scene, or its keypoints, and of hashable arguments that computes each result once.
 
     The scene object holds the results, so that they live as long as it does; a scene made by `replace` has none. Do not
     change the scene or the results in place.

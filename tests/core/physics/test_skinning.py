@@ -8,7 +8,7 @@ import torch
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import covariance, matrix
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints, farthest_points, nearest_weights
-from stages.core.physics.skinning import Skinning, fit_rotations, object_rotations
+from stages.core.physics.skinning import KeypointDeformation, Skinning, fit_rotations, object_rotations
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Binding, Keypoints
@@ -109,6 +109,18 @@ def test_skinning_is_reused_for_many_frames():
     skinning(keypoints.rest + 1)
     again = skinning(keypoints.rest)
     assert isinstance(again, Gaussians) and torch.equal(again.means, g.means)
+
+
+def test_what_follows_the_same_keypoints_shares_their_motion(monkeypatch):
+    g, binding, keypoints = prepared(scene_of("cloud"))
+    frames = [keypoints.rest @ TURN.mT, keypoints.rest @ TURN, keypoints.rest @ TURN.mT]
+    alone = [Skinning(g, binding, replace(keypoints))(x).means for x in frames]
+    found, gradients = [], KeypointDeformation._gradients
+    monkeypatch.setattr(KeypointDeformation, "_gradients", lambda self, u: found.append(u) or gradients(self, u))
+    both = [Skinning(g, binding, keypoints) for _ in range(2)]
+    for x, expected in zip(frames, alone, strict=True):
+        assert all(torch.equal(skinning(x).means, expected) for skinning in both)
+    assert len(found) == len(frames)
 
 
 def test_farthest_points_cover_a_square():

@@ -51,7 +51,7 @@ def rgb_to_sh(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
 
 
 @cache
-def _probes() -> tuple[Tensor, dict[int, Tensor]]:
+def probes() -> tuple[Tensor, dict[int, Tensor]]:
     """Fixed unit directions, and for each band the pseudo-inverse that maps values there to coefficients."""
     dirs = torch.randn(16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     dirs = dirs / dirs.norm(dim=-1, keepdim=True)
@@ -67,7 +67,7 @@ def rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Te
     degree = degree_of(sh.shape[1])
     if degree == 0:
         return sh
-    dirs, inverses = _probes()
+    dirs, inverses = probes()
     dirs = dirs.to(sh)
     values = basis(torch.einsum("nji,dj->ndi", R, dirs), degree)  # the old functions at R^T d
     bands = [sh[:, :1]]

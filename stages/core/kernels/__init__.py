@@ -8,6 +8,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | file                          | written in                  | specified and tested by                              |
 |-------------------------------|-----------------------------|------------------------------------------------------|
 | skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
+| sh_rotation                   | C++ and CUDA snippets       | `geometry.harmonics.rotate_sh`                       |
 | depth_lookup                  | Warp                        | `DepthLookup` in the file                            |
 | nearest_rotations             | Warp                        | `geometry.rotations.nearest_rotation`                |
 | sphere_shadows                | Warp                        | `blocked_light_reference` in the file                |

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import quaternion
 from stages.core.kernels.nearest_rotations import nearest_rotations
+from stages.core.kernels.sh_rotation import rotate_each_sh
 from stages.core.kernels.skinning import KeypointMotion, skin_gaussians
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
@@ -37,7 +37,7 @@ class Skinning:
         if motion is None:
             return g
         means, quats, scales, R = skin_gaussians(self._binding, motion, part)
-        moved = {"means": means, "quats": quats, "scales": scales, "sh": _rotate_sh(part.sh, R)}
+        moved = {"means": means, "quats": quats, "scales": scales, "sh": rotate_each_sh(part.sh, R)}
         whole = {name: getattr(g, name).index_copy(0, self._moving, value) for name, value in moved.items()}
         return Gaussians(**whole, opacities=g.opacities, object_id=g.object_id)
 
@@ -129,15 +129,3 @@ def keypoint_neighbours(keypoints: Keypoints) -> Int[Tensor, "p j"]:
         _, index = knn(rest[own], rest[own], DEFORMATION_NEIGHBOURS + 1)
         around[own] = own[index[:, 1:]]
     return around
-
-
-def _rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
-    """SH coefficients rotated with each Gaussian; those with the identity rotation stay the same, bit for bit."""
-    if sh.shape[1] == 1:
-        return sh
-    rotated = R.ne(torch.eye(3).to(R)).flatten(1).any(1).nonzero()[:, 0]
-    if not len(rotated):
-        return sh
-    # on a CPU in pieces that fit into the cache: three times faster
-    pieces = rotated.split(len(rotated) if sh.is_cuda else 8192)
-    return sh.index_copy(0, rotated, torch.cat([rotate_sh(sh[part], R[part]) for part in pieces]))

@@ -1,13 +1,17 @@
-"""C++ snippets of `projection`: colour from spherical harmonics and its adjoint, 16 Gaussians at a time.
+"""C++ snippets: spherical harmonics, and for `projection` colour from them and its adjoint, 16 Gaussians at a time.
 
 Basis, order and signs as in stages/core/geometry/harmonics.py.
 """
 
-HARMONICS = r"""
+_DIRECTION = r"""
 F d[3] = {m[0] - cam[16], m[1] - cam[17], m[2] - cam[18]};
 F id = 1.0f / vsqrt(d[0]*d[0] + d[1]*d[1] + d[2]*d[2] + 1e-30f);
 for (int i = 0; i < 3; ++i) d[i] *= id;
-F x = d[0], y = d[1], h = d[2], Y[16];
+F x = d[0], y = d[1], h = d[2];
+"""
+
+BASIS = r"""
+F Y[16];
 Y[0] = (F)(0.28209479177387814f);
 const float k1 = 0.4886025119029199f, k2 = 1.0925484305920792f, k20 = 0.31539156525252005f;
 const float k33 = 0.5900435899266435f, k32 = 2.890611442640554f, k31 = 0.4570457994644658f, k30 = 0.3731763325901154f;
@@ -21,10 +25,15 @@ if (k > 9) {
     Y[12] = k30 * h * (5 * h * h - 3); Y[13] = -k31 * x * (5 * h * h - 1);
     Y[14] = 0.5f * k32 * h * (x * x - y * y); Y[15] = -k33 * x * (x * x - 3 * y * y);
 }
+"""
+"""In: unit direction x, y, h and the number k of functions. Out: their values Y."""
+
+_COLOUR = r"""
 F rgb[3] = {(F)(0.5f), (F)(0.5f), (F)(0.5f)};
 for (int i = 0; i < k; ++i)
     for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(sh, 3 * k, 3 * i + c);
 """
+HARMONICS = _DIRECTION + BASIS + _COLOUR
 """In: means m, camera centre cam[16..18], k coefficients sh. Out: unit direction d, basis Y, rgb (not clamped)."""
 
 HARMONICS_ADJOINT = r"""

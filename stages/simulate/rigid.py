@@ -250,7 +250,8 @@ class _World:
                 return ball_shape(scale * (b.shape.ball.centre - b.shape.com.double().numpy()),
                                   scale * b.shape.ball.radius)  # fmt: skip
             ground, frame = b.ground / self.scene.metres_per_unit, BodyFrame(tuple(b.shape.com.tolist()), scale)
-            return object_shape(self.scene, self._ids[row], options.seed, ground, frame, b.shape.convex)
+            hull = tuple(map(tuple, b.shape.hull.tolist())) if b.shape.convex else ()
+            return object_shape(self.scene, self._ids[row], options.seed, ground, frame, hull)
 
         return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self.bodies))))
 

@@ -26,10 +26,11 @@ from scipy.spatial import ConvexHull, QhullError
 from stages.core.geometry.extremes import fibonacci
 from stages.core.geometry.surface_faces import nearest_points, surface_faces
 from stages.core.kernels.depth_lookup import Samples, depth_lookup, turned
-from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 from stages.simulate.initial_overlaps import AllowedOverlaps
+from stages.simulate.standing_surface import StandingSurface
 
 FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
@@ -66,22 +67,24 @@ class BodyFrame(NamedTuple):
 
 @cached_in_scene
 def object_shape(
-    scene: Scene, object_id: int, seed: int, bottom: float, frame: BodyFrame, convex: bool
+    scene: Scene, object_id: int, seed: int, bottom: float, frame: BodyFrame, hull: tuple[tuple[float, ...], ...]
 ) -> SurfaceShape:
-    """The `surface_shape` of the body of an object. Raises InputError for one without any usable Gaussian."""
-    return surface_shape(solid_surface(scene, object_id, seed), bottom, frame, convex)
+    """The `surface_shape` of the body of an object; `hull` has the vertices of a convex one.
+
+    Raises InputError for one without any usable Gaussian.
+    """
+    filled = ConvexHull(np.array(hull)) if hull else None
+    return surface_shape(StandingSurface(solid_surface(scene, object_id, seed).fitted, filled, bottom), frame)
 
 
-def surface_shape(body: SolidSurface, bottom: float, frame: BodyFrame, convex: bool) -> SurfaceShape:
-    """The shape of a body that ends at the height `bottom`, in this frame."""
+def surface_shape(body: StandingSurface, frame: BodyFrame) -> SurfaceShape:
+    """The shape of a body in this frame."""
     com, scale = np.array(frame.com), frame.scale
-    points, normals = body.fitted.samples_above(bottom)
-    points = scale * (points - com)
-    depth, low = body.fitted.depth_grid()
-    height = low[2] + body.h * np.arange(depth.shape[2])
-    depth, low, h = scale * np.minimum(depth, height - bottom), scale * (low - com), scale * body.h
-    return SurfaceShape(points, normals, *surface_faces(points, normals), nearest_points(points, depth, low, h),
-                        depth, low, h, convex)  # fmt: skip
+    points, normals, at_edge = body.points()
+    depth, low = body.depth_grid()
+    points, depth, low, h = scale * (points - com), scale * depth, scale * (low - com), scale * body.surface.h
+    return SurfaceShape(points, normals, *surface_faces(points, normals, at_edge),
+                        nearest_points(points, depth, low, h), depth, low, h, body.hull is not None)  # fmt: skip
 
 
 def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:

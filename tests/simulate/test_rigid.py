@@ -198,6 +198,17 @@ def test_a_tray_that_stood_on_the_floor_has_an_underside_that_falls_on_a_ball(tm
     assert float(t.positions[-1, t.keypoints.object_id == 1, 2].min()) > 0.09
 
 
+def test_a_lid_on_a_block_stays_level(tmp_path):
+    """It touches the block with the inside of its top: edges of the block are no overlap at the start."""
+    sides = [((0.015, 0.3, 0.1), (x, 0, 0.05)) for x in (-0.1425, 0.1425)]
+    sides += [((0.3, 0.015, 0.1), (0, y, 0.05)) for y in (-0.1425, 0.1425)]
+    lid = compound(0.007, ((0.3, 0.3, 0.015), (0, 0, 0.0925)), *sides).moved((0.0, 0.0, 0.035))
+    block = box((0.1, 0.1, 0.12), 0.008).moved((0.04, 0.0, 0.06))
+    t = roll(tmp_path, block, lid, friction=0.5, steps=40)
+    assert float((t.com[-1, 1] - t.com[0, 1]).norm()) < 1e-4
+    assert float(matrix(t.rotation[-1, 1])[2, 2]) > math.cos(math.radians(0.05))
+
+
 def test_a_heavy_box_that_falls_on_a_card_lies_on_it(tmp_path):
     """On 2 mm that weigh 1/160 of it: the card would need hundreds of impacts on box and floor to stop the box."""
     card = box((0.09, 0.06, 0.002), 0.003).moved((0.0, 0.0, 0.001))

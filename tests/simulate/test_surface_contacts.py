@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from stages.core.physics.solid_surface import SolidSurface, _voxels_along, solid_surface
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
+from stages.simulate.standing_surface import StandingSurface
 from stages.simulate.surface_contacts import BodyFrame, SurfaceContacts, SurfaceShape, ball_shape, surface_shape
 from tests.simulate.motion import roll_out
 from tests.simulate.test_rigid import cube, options_of, scene_of
@@ -133,7 +135,7 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     body = SolidSurface(np.stack(np.meshgrid(line, line, line[np.abs(line) < 0.25], indexing="ij"), -1).reshape(-1, 3),
                         0.02, points)  # fmt: skip
     com = np.array([0.1, 0.0, 0.05])
-    shape = surface_shape(body, -0.125, BodyFrame(tuple(com), 2.0), convex=False)
+    shape = surface_shape(StandingSurface(body.fitted, None, -0.125), BodyFrame(tuple(com), 2.0))
     at = np.round((2 * (np.array([0.0, 0.0, -0.09]) - com) - shape.low) / shape.h).astype(int)
     assert shape.depth[tuple(at)] == pytest.approx(2 * 0.035, abs=0.03) and shape.h == pytest.approx(0.04)
     x = shape.points / 2 + com
@@ -155,6 +157,19 @@ def test_a_body_that_ends_about_at_the_floor_has_one_underside(gap):
     under = (normals[:, 2] < -0.9) & (np.abs(x[:, :2]) < 0.45).all(1)
     assert np.abs(x[under, 2] - max(0.0, -gap)).max() < 0.0025 + 1e-9 and (x[:, 2] >= -gap).all()
     assert 7000 < under.sum() < 10000  # one in each voxel
+
+
+def test_a_convex_body_has_the_faces_of_its_hull():
+    """A cube, samples of which beyond an edge are on no face."""
+    line = np.arange(-0.475, 0.5, 0.05)
+    points = box((1.0, 1.0, 1.0), 0.04).points.double().numpy()
+    body = SolidSurface(np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3), 0.05, points)
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
+    shape = surface_shape(StandingSurface(body.fitted, ConvexHull(corners), -1.0), BodyFrame((0.0, 0.0, 0.0), 1.0))
+    assert shape.convex and np.abs(np.abs(shape.points).max(1) - 0.5).max() < 0.0026 and len(shape.points) > 1000
+    node = shape.low + shape.h * np.indices(shape.depth.shape).transpose(1, 2, 3, 0)
+    near = np.abs(shape.depth) < shape.h
+    np.testing.assert_allclose(shape.depth[near], 0.5 - np.abs(node[near]).max(1), atol=1e-6)
 
 
 def test_depths_on_the_grid_are_those_at_its_nodes():

@@ -28,27 +28,23 @@ class ObservedSpace:
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
-    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views or `weigh`
+    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views
     device: str = "cpu"  # that renders; the maps are on the CPU
 
     @staticmethod
     @torch.no_grad()
-    def of(scene: Scene, device: str = "cpu", weigh: bool = True) -> ObservedSpace:
-        """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative.
-
-        With `weigh` also the weights of the Gaussians, which take as long.
-        """
+    def of(scene: Scene, device: str = "cpu") -> ObservedSpace:
+        """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative."""
         if scene.cameras is None or not len(scene.cameras):
             return ObservedSpace([], [], torch.zeros(0))
         views, maps, g = downscaled_views(scene.cameras), [], scene.gaussians.to(device)
-        weight = torch.zeros(len(g) if weigh else 0, device=g.means.device)
+        weight = torch.zeros(len(g), device=g.means.device)
         for viewmat, K, width, height in views:
-            rendered = rasterise(g, viewmat[None], K[None], width, height)
-            depth = torch.where(rendered.alpha[0] > MIN_OPAQUE_ALPHA, rendered.depth[0], 0.0)
-            depth = torch.where(rendered.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
+            seen = visibility(g, viewmat, K, width, height)
+            depth = torch.where(seen.alpha > MIN_OPAQUE_ALPHA, seen.depth, 0.0)
+            depth = torch.where(seen.alpha < MAX_EMPTY_ALPHA, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0].cpu())
-            if weigh:
-                weight = torch.maximum(weight, visibility(g, viewmat, K, width, height).weight)
+            weight = torch.maximum(weight, seen.weight)
         return ObservedSpace(views, maps, weight.cpu(), device)
 
     def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
@@ -103,8 +99,8 @@ def object_psnr(before: Scene, after: Scene, max_views: int = 4, device: str = "
     error = count = 0.0
     states = [scene.gaussians.to(device) for scene in (before, after)]
     for viewmat, K, width, height in downscaled_views(before.cameras, max_views):
-        one, two = (rasterise(g, viewmat[None], K[None], width, height).rgb[0] for g in states)
-        index = visibility(states[0], viewmat, K, width, height).index
+        one, *_, index, _ = visibility(states[0], viewmat, K, width, height)
+        two = rasterise(states[1], viewmat[None], K[None], width, height).rgb[0]
         on = (index >= 0) & (states[0].object_id[index.clamp_min(0)] > 0)
         error += float((one.clamp(0, 1) - two.clamp(0, 1))[on].square().sum())
         count += 3 * float(on.sum())

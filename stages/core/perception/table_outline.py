@@ -56,7 +56,7 @@ def table_outline(scene: Scene, device: str = "cpu") -> TableOutline | None:
     support = find_support(scene)
     if support is None:
         return None
-    past, known, heights = _seen_past(support, ObservedSpace.of(scene, device, weigh=False))
+    past, known, heights = _seen_past(support, ObservedSpace.of(scene, device))
     table = ndimage.binary_opening(support.region.numpy() & ~past, iterations=2)
     parts, count = ndimage.label(table)
     if not count:

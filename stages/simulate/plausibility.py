@@ -48,6 +48,7 @@ class PlausibilityMonitor:
         self._rest = [keypoints.rest[rows].double().numpy() for rows in self._rows]
         self._few = [slice(None, None, -(-max(len(r), 1) // MAX_CHECKED_KEYPOINTS)) for r in self._rest]
         self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest]).clip(1e-9)
+        self._radius = [max(_radius(r), 1e-12) if len(r) else 1.0 for r in self._rest]
         self._floor = options.floor if options.floor is not None else scene.floor
         self._table = table_of(scene, options) if options.engine == "rigid" else None
         self._left = np.zeros(len(scene.objects), bool)  # the table, over its edge
@@ -73,9 +74,9 @@ class PlausibilityMonitor:
             self._origin = com - lift
         self._com.append(com)
         self._frames += 1
-        for i, (p, rest) in enumerate(zip(points, self._rest, strict=True)):
+        for i, (p, radius) in enumerate(zip(points, self._radius, strict=True)):
             if len(p):
-                self._spread[i] = max(self._spread[i], abs(_radius(p) / max(_radius(rest), 1e-12) - 1))
+                self._spread[i] = max(self._spread[i], abs(_radius(p) / radius - 1))
         self._measure_penetration(points, com, R)
         mass = np.ones(len(com)) if state.mass is None else state.mass.double().numpy()
         if self._before is not None:

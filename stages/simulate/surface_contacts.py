@@ -355,7 +355,7 @@ def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.nda
     row = np.arange(len(x))
     key = 6 * pair + 2 * axis + (normal[row, axis] > 0)
     u, v = x[row, (axis + 1) % 3], x[row, (axis + 2) % 3]
-    return largest_of_groups(np.stack([u, -u, v, -v, u + v, u - v, -u + v, -u - v, depth]), key)
+    return largest_of_groups(np.array([u, -u, v, -v, u + v, u - v, -u + v, -u - v, depth]), key)
 
 
 def largest_of_groups(values: np.ndarray, key: np.ndarray) -> np.ndarray:
@@ -364,12 +364,13 @@ def largest_of_groups(values: np.ndarray, key: np.ndarray) -> np.ndarray:
     """
     if not len(key):
         return NONE[0]
-    order = key.argsort(kind="stable")
-    begins = np.diff(key[order], prepend=key.min() - 1) != 0
-    first, values = np.flatnonzero(begins), values[:, order]
+    order, begins, chosen = key.argsort(kind="stable"), np.ones(len(key), bool), np.zeros(len(key), bool)
+    key, values = key[order], values[:, order]
+    begins[1:] = key[1:] != key[:-1]
+    first = np.flatnonzero(begins)
     largest = np.maximum.reduceat(values, first, axis=1)[:, begins.cumsum() - 1]
-    last = np.maximum.reduceat(np.where(values == largest, np.arange(len(key)), -1), first, axis=1)
-    return np.unique(order[last])
+    chosen[order[np.maximum.reduceat(np.where(values == largest, np.arange(len(key)), -1), first, axis=1)]] = True
+    return np.flatnonzero(chosen)
 
 
 def _frames(normal: np.ndarray) -> np.ndarray:
@@ -381,7 +382,7 @@ def _frames(normal: np.ndarray) -> np.ndarray:
     sign = np.where(z < 0, -1.0, 1.0)
     a = -1 / (sign + z)
     b = x * y * a
-    return np.stack([x, y, z, 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y], 1)
+    return np.array([x, y, z, 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y]).T
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

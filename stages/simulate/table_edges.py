@@ -73,6 +73,8 @@ class TableEdges:
         """The outermost points (n, 3) at which edges (e, 2, 3) of a body cross edges of the table at a depth above
         `sunk`.
         """
+        if not len(ends):
+            return ends[:, 0]
         side = ends[..., :2] @ self._outline.normals.T - self._outline.offsets  # (e, 2, k)
         of, row = np.nonzero((side[:, 0] * side[:, 1] < 0).T)  # edges of the table and of the body
         a, b = side[row, 0, of], side[row, 1, of]
@@ -80,7 +82,7 @@ class TableEdges:
         kept = (x[:, 2] < self._floor - sunk) & (self._outline.beyond(x) < ON_EDGE)
         x, normal = x[kept], self._outline.normals[of[kept]]
         along = x[:, 1] * normal[:, 0] - x[:, 0] * normal[:, 1]
-        return x[largest_of_groups(np.stack([-along, along, -x[:, 2]]), of[kept])]
+        return x[largest_of_groups(np.array([-along, along, -x[:, 2]]), of[kept])]
 
 
 def _hull_edges(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

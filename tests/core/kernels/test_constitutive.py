@@ -33,7 +33,7 @@ def update_materials(model, F, stiffness, plastic, state, dt: float = 0.0) -> tu
     return F, tau, state
 
 
-def respond(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 0.0, dt: float = 0.0, device="cpu"):
+def respond(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 0.0, dt: float = 0.0, *, device: str):
     p = len(F)
     rows = torch.full((p,), model, dtype=torch.int8), F, torch.tensor([[MU, LAM, 0.0]]).repeat(p, 1), \
         torch.tensor([plastic], dtype=torch.float32).repeat(p, 1), torch.full((p,), state)  # fmt: skip
@@ -73,22 +73,24 @@ def test_stress_is_the_derivative_of_the_stored_energy(model, plastic, device):
     torch.testing.assert_close(kept, F, rtol=0, atol=2e-6)
 
 
-def test_corotated_equals_its_reference_including_inversion():
+def test_corotated_equals_its_reference_including_inversion(device):
     F = deformed(size=0.4)
-    torch.testing.assert_close(respond(COROTATED, F)[1], materials.corotated_reference(F, MU, LAM), rtol=0, atol=3)
+    torch.testing.assert_close(
+        respond(COROTATED, F, device=device)[1], materials.corotated_reference(F, MU, LAM), rtol=0, atol=3
+    )
     flat = torch.diag(torch.tensor([1.0, 0.8, -0.2]))[None]
-    stress = respond(COROTATED, flat)[1][0]
+    stress = respond(COROTATED, flat, device=device)[1][0]
     # R of an inverted F has no reflection: principal stress 2 mu (s - 1) s + lambda J (J - 1)
     s, J = torch.tensor([1.0, 0.8, -0.2]), -0.16
     torch.testing.assert_close(stress.diag(), 2 * MU * (s - 1) * s + LAM * J * (J - 1), rtol=0, atol=3.0)
 
 
-def test_small_strains_follow_hookes_law():
+def test_small_strains_follow_hookes_law(device):
     # uniaxial strain e: stress (lambda + 2 mu) e along, lambda e across; finite strain changes it by order e^2
     e = 1e-3
     F = torch.diag(torch.tensor([1 + e, 1.0, 1.0]))[None]
     for model, plastic in ((NEO_HOOKEAN, (0, 0, 0)), (COROTATED, (0, 0, 0)), (VON_MISES, (1e9, 0, 0))):
-        tau = respond(model, F, plastic)[1][0]
+        tau = respond(model, F, plastic, device=device)[1][0]
         expected = torch.tensor([LAM + 2 * MU, LAM, LAM]) * e
         torch.testing.assert_close(tau.diag(), expected, rtol=3 * e, atol=0.05)
 
@@ -102,68 +104,72 @@ def deviator(tau: torch.Tensor) -> float:
     return float((tau - torch.einsum("pii->p", tau)[:, None, None] / 3 * torch.eye(3)).norm())
 
 
-def test_von_mises_yields_at_the_yield_stress_and_preserves_volume():
+def test_von_mises_yields_at_the_yield_stress_and_preserves_volume(device):
     strength, F = 1e3, shear(0.2)
-    kept, tau, state = respond(VON_MISES, F, (strength, 0, 0))
+    kept, tau, state = respond(VON_MISES, F, (strength, 0, 0), device=device)
     assert deviator(tau) == pytest.approx(math.sqrt(2 / 3) * strength, rel=1e-4)
     assert float(torch.linalg.det(kept)) == pytest.approx(1.0, abs=1e-5)  # plastic flow is isochoric
     # elastic below the yield stress
     small = shear(0.5 * strength / (math.sqrt(3) * MU))
-    torch.testing.assert_close(respond(VON_MISES, small, (strength, 0, 0))[0], small, rtol=0, atol=1e-6)
+    torch.testing.assert_close(respond(VON_MISES, small, (strength, 0, 0), device=device)[0], small, rtol=0, atol=1e-6)
     # accumulated plastic strain: sqrt(2/3) |de| of the Hencky strain
     e = torch.linalg.svdvals(F).log()[0]
     flow = float(e.norm()) - math.sqrt(2 / 3) * strength / (2 * MU)
     assert float(state) == pytest.approx(math.sqrt(2 / 3) * flow, rel=1e-3)
 
 
-def test_hardening_and_softening_move_the_yield_stress():
+def test_hardening_and_softening_move_the_yield_stress(device):
     for H in (5e3, -2e3):
-        _, tau, state = respond(VON_MISES, shear(0.2), (1e3, H, 0))
+        _, tau, state = respond(VON_MISES, shear(0.2), (1e3, H, 0), device=device)
         assert deviator(tau) == pytest.approx(math.sqrt(2 / 3) * (1e3 + H * float(state)), rel=1e-3)
-    _, tau, _ = respond(VON_MISES, shear(0.2), (1e3, -2e3, 0), state=10.0)  # softened to the residual strength
+    # softened to the residual strength
+    _, tau, _ = respond(VON_MISES, shear(0.2), (1e3, -2e3, 0), state=10.0, device=device)
     assert deviator(tau) == pytest.approx(materials.RESIDUAL_STRENGTH * math.sqrt(2 / 3) * 1e3, rel=1e-3)
 
 
-def test_viscoplastic_stress_relaxes_at_the_rate_of_perzyna_viscosity():
+def test_viscoplastic_stress_relaxes_at_the_rate_of_perzyna_viscosity(device):
     # Perzyna: the stress above the yield surface decays as exp(-2 mu t / eta)
     strength, eta, F, dt = 1e3, 8e4, shear(0.1), 0.01
     rows = (torch.tensor([VON_MISES], dtype=torch.int8), torch.tensor([[MU, LAM, 0.0]]),
             torch.tensor([[strength, 0.0, eta]]))  # fmt: skip
-    limit, state, excess = math.sqrt(2 / 3) * strength, torch.zeros(1), []
+    model, stiffness, plastic, F, state = (x.to(device) for x in (*rows, F, torch.zeros(1)))
+    limit, excess = math.sqrt(2 / 3) * strength, []
     for _ in range(60):
-        F, tau, state = update_materials(rows[0], F, rows[1], rows[2], state, dt)
-        excess.append(deviator(tau) - limit)
+        F, tau, state = update_materials(model, F, stiffness, plastic, state, dt)
+        excess.append(deviator(tau.cpu()) - limit)
     rate = math.log(excess[0] / excess[-1]) / (59 * dt)
     # implicit Euler: a factor 1 + 2 mu dt / eta per step instead of the exponential
     assert rate == pytest.approx(math.log(1 + 2 * MU * dt / eta) / dt, rel=0.01)
     assert rate == pytest.approx(2 * MU / eta, rel=0.01)
-    at_once = respond(VON_MISES, shear(0.1), (strength, 0, eta), dt=0.0)
+    at_once = respond(VON_MISES, shear(0.1), (strength, 0, eta), dt=0.0, device=device)
     torch.testing.assert_close(at_once[0], shear(0.1), rtol=0, atol=1e-6)  # dt = 0: no flow
 
 
-def test_sand_is_projected_to_its_cone_and_separates_without_stress():
+def test_sand_is_projected_to_its_cone_and_separates_without_stress(device):
     angle = math.radians(35)
     slope = materials.sand_slope(35.0)
     F = (torch.diag(torch.tensor([0.98, 0.97, 0.99])) @ shear(0.3)[0])[None]
-    _, tau, state = respond(SAND, F, (slope, 0, 0))
+    _, tau, state = respond(SAND, F, (slope, 0, 0), device=device)
     pressure = -float(torch.einsum("pii->", tau)) / 3
     # in plane strain Coulomb's limit is a shear of sin x pressure, and |dev| is sqrt(2) times the shear
     limit = math.sqrt(2) * math.sin(angle)
     assert deviator(tau) == pytest.approx(limit * pressure, rel=1e-3)
     assert float(state) == 0
     apart = torch.diag(torch.tensor([1.1, 1.0, 1.0]))[None]
-    kept, tau, state = respond(SAND, apart, (slope, 0, 0))
+    kept, tau, state = respond(SAND, apart, (slope, 0, 0), device=device)
     assert float(tau.abs().max()) < 1e-2 and float(state) == pytest.approx(math.log(1.1), rel=1e-4)
     torch.testing.assert_close(kept, torch.eye(3)[None], rtol=0, atol=1e-6)
     # a volume gain of 10 % is compressed away before stress builds up again
-    _, tau, state = respond(SAND, torch.diag(torch.tensor([0.95, 1.0, 1.0]))[None], (slope, 0, 0), state=math.log(1.1))
+    _, tau, state = respond(
+        SAND, torch.diag(torch.tensor([0.95, 1.0, 1.0]))[None], (slope, 0, 0), state=math.log(1.1), device=device
+    )
     assert float(tau.abs().max()) < 1e-2 and float(state) == pytest.approx(math.log(1.1 * 0.95), abs=1e-4)
 
 
-def test_snow_compacts_and_hardens():
+def test_snow_compacts_and_hardens(device):
     compress, stretch, xi = 0.025, 0.0075, 10.0
     compressed = 0.9 * torch.eye(3)[None]
-    kept, tau, state = respond(SNOW, compressed, (compress, stretch, xi))
+    kept, tau, state = respond(SNOW, compressed, (compress, stretch, xi), device=device)
     torch.testing.assert_close(kept, (1 - compress) * torch.eye(3)[None], rtol=0, atol=1e-5)
     Jp = 0.9**3 / (1 - compress) ** 3
     assert math.exp(float(state)) == pytest.approx(Jp, rel=1e-4)
@@ -171,6 +177,6 @@ def test_snow_compacts_and_hardens():
     J, s = (1 - compress) ** 3, 1 - compress
     assert hard > 1
     assert float(tau[0, 0, 0]) == pytest.approx(hard * (2 * MU * (s - 1) * s + LAM * J * (J - 1)), rel=2e-3)
-    kept, _, state = respond(SNOW, 1.1 * torch.eye(3)[None], (compress, stretch, xi))
+    kept, _, state = respond(SNOW, 1.1 * torch.eye(3)[None], (compress, stretch, xi), device=device)
     torch.testing.assert_close(kept, (1 + stretch) * torch.eye(3)[None], rtol=0, atol=1e-5)
     assert float(state) > 0  # stretching softens

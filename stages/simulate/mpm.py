@@ -17,6 +17,7 @@ from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
+from stages.core.kernels.mpm.constitutive import COROTATED, MAX_LOSS, NEO_HOOKEAN, maxwell_branches
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import nearest_weights
 from stages.core.physics.material_parts import part_of_points
@@ -126,14 +127,12 @@ def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) ->
     """Give the particles the material and the pins of `new`; those that are pinned now stop."""
     stopped = (new.held > 0) & (particles.held == 0)
     now = solver.particles
-    for name in ("mass", "stiffness", "friction", "held", "plastic"):
-        setattr(particles, name, getattr(new, name))
+    changed = {name: getattr(new, name) for name in
+               ("mass", "stiffness", "friction", "held", "plastic", "branch_modulus", "branch_rate")}  # fmt: skip
+    for name, value in changed.items():
+        setattr(particles, name, value)
     solver.set(
-        mass=new.mass,
-        stiffness=new.stiffness,
-        friction=new.friction,
-        held=new.held,
-        plastic=new.plastic,
+        **changed,
         v=now.v * ~stopped[:, None].to(now.v.device),
         C=now.C * ~stopped[:, None, None].to(now.C.device),
     )
@@ -153,6 +152,7 @@ def _particles(
     unit, body, x = scene.metres_per_unit, setup.bodies.body, setup.bodies.x
     h, volume = setup.bodies.spacing * unit, setup.bodies.volume * unit**3
     columns = torch.zeros(len(body), 9)  # E density nu viscosity friction model, and its three parameters
+    branches = torch.zeros(len(body), 4)  # moduli and rates
     velocity, held = torch.zeros(len(body), 3), torch.zeros(len(body), dtype=torch.int8)
     for row, o in enumerate(scene.objects):
         choice, mine = setup.materials[o.id], (body == row).nonzero()[:, 0]
@@ -161,8 +161,9 @@ def _particles(
         part_of = part_of_points(choice, x[mine])
         for k, part in enumerate(choice.parts):
             m, rows = part.material, mine[part_of == k]
-            E, viscosity, loss = _stable_material(m, length, h, level)
+            E, loss, viscosity, modulus, rate = _stable_material(m, length, h, level)
             model = MODELS[m.model]
+            branches[rows] = torch.tensor([*modulus, *rate])
             columns[rows] = torch.tensor([E, m.density, m.nu, viscosity, friction, model.kernel,
                                           *model.solver_parameters(m.plastic, E / m.E)])  # fmt: skip
             held[rows] = part.pinned or o.id in prompts.pinned
@@ -181,23 +182,41 @@ def _particles(
     E, density, nu, viscosity, friction, model = columns[:, :6].unbind(1)
     particles = mpm.at_rest(setup.start * unit, volume, mpm.ParticleMaterial(E, nu, density, viscosity, friction))
     particles.model, particles.plastic = model.to(torch.int8), columns[:, 6:].contiguous()
+    if bool(branches.any()):
+        particles = mpm.with_branches(particles, branches[:, :2].contiguous(), branches[:, 2:].contiguous())
     particles.rest = x * unit
     particles.v, particles.held = velocity * (held == 0)[:, None], held
     return particles
 
 
-def _stable_material(m: Material, length: float, h: float, level: MpmQuality) -> tuple[float, float, float]:
-    """Young's modulus [Pa], viscosity [Pa s] and loss factor of a body, as large as the substep allows.
+class _StableMaterial(NamedTuple):
+    """What the solver takes for a material."""
 
-    The viscosity gives the slowest longitudinal vibration of a bar of the body's `length` [m], omega = pi c / L, the
-    material's loss factor; damping E loss / omega is that of a Kelvin-Voigt solid. `h` is the particle spacing [m].
+    E: float  # [Pa]
+    loss: float  # factor tan(delta)
+    viscosity: float  # [Pa s]
+    branch_modulus: tuple[float, float]  # over E
+    branch_rate: tuple[float, float]  # [1/s]
+
+
+def _stable_material(m: Material, length: float, h: float, level: MpmQuality) -> _StableMaterial:
+    """The material of a body of this `length` [m], as stiff as the substep allows; `h` is the particle spacing [m].
+
+    Elastic materials have their loss factor from the slowest longitudinal vibration of a bar of this length, omega =
+    pi c / L, down to a tenth of that frequency, by Maxwell branches; impacts are a few times slower than the vibration.
+    The substep is shorter by what the branches add to the stiffness. Materials that flow have the viscosity
+    E loss / omega of a Kelvin-Voigt solid, as far as the substep allows.
     """
     substep = level.substep(h)
     fastest = CFL_MARGIN * mpm.SAFETY * 2 * h / substep
+    elastic = MODELS[m.model].kernel in (NEO_HOOKEAN, COROTATED)
+    loss = min(m.loss, MAX_LOSS)
     E = min(m.E, mpm.modulus_at_wave_speed(fastest, m.nu, m.density))
-    per_loss = E * length / (math.pi * math.sqrt(E / m.density))
-    viscosity = min(m.loss * per_loss, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / substep)
-    return E, viscosity, viscosity / per_loss
+    omega = math.pi * math.sqrt(E / m.density) / length
+    if elastic:
+        return _StableMaterial(E, loss, 0.0, *maxwell_branches(loss, omega))
+    viscosity = min(m.loss * E / omega, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / substep)
+    return _StableMaterial(E, viscosity * omega / E, viscosity, (0.0, 0.0), (0.0, 0.0))
 
 
 class _PromptedForce:

@@ -180,3 +180,24 @@ def test_snow_compacts_and_hardens(device):
     kept, _, state = respond(SNOW, 1.1 * torch.eye(3)[None], (compress, stretch, xi), device=device)
     torch.testing.assert_close(kept, (1 + stretch) * torch.eye(3)[None], rtol=0, atol=1e-5)
     assert float(state) > 0  # stretching softens
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05, 0.15, 0.3, materials.MAX_LOSS])
+def test_maxwell_branches_dissipate_alike_over_a_decade(loss):
+    omega = 20.0
+    modulus, rate = materials.maxwell_branches(loss, omega)
+
+    def measured(w: float) -> float:
+        """tan(delta) of a unit spring beside the branches, each of complex modulus m i w / (k + i w)."""
+        E = 1 + sum(m * 1j * w / (k + 1j * w) for m, k in zip(modulus, rate, strict=True))
+        return E.imag / E.real
+
+    assert measured(omega) == pytest.approx(loss) and measured(omega / 10) == pytest.approx(loss)
+    between = [measured(omega / 10**n) / max(loss, 1e-9) for n in (0.2, 0.4, 0.5, 0.6, 0.8)]
+    assert loss == 0 or (min(between) > 0.95 and max(between) < (1.1 if loss <= 0.3 else 1.3))
+    assert all(m >= 0 for m in modulus)
+
+
+def test_maxwell_branches_have_a_largest_loss():
+    with pytest.raises(ValueError, match="between 0 and 0.6"):
+        materials.maxwell_branches(0.61, 1.0)

@@ -22,19 +22,35 @@ def cloud(p: int = 300, seed: int = 0) -> mpm.Particles:
     return particles
 
 
+def viscoelastic_cloud() -> mpm.Particles:
+    """The same with strained Maxwell branches."""
+    rng = torch.Generator().manual_seed(1)
+    p = cloud()
+    p = mpm.with_branches(p, torch.rand(len(p), 2, generator=rng), 500 * torch.rand(len(p), 2, generator=rng))
+    strain = 0.1 * torch.randn(len(p), 2, 3, 3, generator=rng)
+    p.branch_strain = strain + strain.mT
+    return p
+
+
+@pytest.mark.parametrize("make", [cloud, viscoelastic_cloud])
 @pytest.mark.parametrize("device", DEVICES)
-def test_substep_equals_its_reference(device):
+def test_substep_equals_its_reference(device, make):
     # float32 against float64: sums of a few dozen terms, so 1e-5 of the largest value
-    ours = cloud()
+    ours = make()
     solver = mpm.Solver(ours, mpm.Box((0, 0, 0), (1, 1, 1)), DX, device)
     push = torch.tensor([0.5, 0.0, -9.81]).repeat(len(ours), 1)
     solver.advance(DT, push, substeps=1)
-    theirs = {k: getattr(ours, k).double() for k in ("x", "v", "C", "F", "mass", "volume", "stiffness")}
+    columns = ("x", "v", "C", "F", "mass", "volume", "stiffness", "branch_modulus", "branch_strain")
+    theirs = {k: getattr(ours, k).double() for k in columns}
     expected = substep_reference({**theirs, "acceleration": push.double()}, solver.grid, FRICTION, DT)
     got = solver.particles
     for name, value in zip(("x", "v", "C", "F"), expected, strict=True):
         scale = float(value.abs().max())
         torch.testing.assert_close(getattr(got, name).cpu().double(), value, rtol=0, atol=2e-5 * scale, msg=name)
+    kept = 1 / (1 + DT * ours.branch_rate.double())[..., None, None]
+    change = expected[2][:, None] @ (torch.eye(3) + theirs["branch_strain"])
+    strain = kept * (theirs["branch_strain"] + DT * (change + change.mT))
+    torch.testing.assert_close(got.branch_strain.cpu().double(), strain, rtol=0, atol=2e-5)
     assert list(solver.grid.low) == [GRID_PADDING] * 3
 
 

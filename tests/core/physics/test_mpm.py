@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 from stages.core.kernels.mpm import grid as mpm_grid
+from stages.core.kernels.mpm.constitutive import maxwell_branches
 from stages.core.physics.mpm import solver as mpm
 from tests.conftest import DEVICES
 
@@ -124,6 +125,45 @@ def test_viscosity_damps_vibration():
         roll(solver, 0.1)
         kept.append(energy(solver.particles, 0.025) / start)
     assert kept[1] < 0.5 * kept[0]
+
+
+@pytest.mark.parametrize("slower", [1.0, 3.0, 10.0])
+def test_a_bar_with_maxwell_branches_loses_the_same_share_of_each_vibration(slower):
+    """Of the energy exp(-2 pi loss) is left after a period, at the upper frequency, a third and a tenth of it."""
+    loss, E, density, length, dx = 0.15, 1e5, 500.0, 0.4, 0.02
+    p = block((length, 0.04, 0.04), dx / 2, E=E, nu=0.0, density=density)
+    omega = math.pi * math.sqrt(E / density) / length
+    modulus, rate = maxwell_branches(loss, slower * omega)
+    p = mpm.with_branches(p, torch.tensor([modulus]).repeat(len(p), 1), torch.tensor([rate]).repeat(len(p), 1))
+    shape = torch.cos(math.pi * p.x[:, 0] / length)
+    p.v[:, 0] = 0.05 * shape
+    solver, frame, signal = mpm.Solver(p, FREE, dx), 1e-3, []
+    for _ in range(180):
+        roll(solver, frame, frame=frame)
+        signal.append(float((solver.particles.v[:, 0] * shape).sum()))
+    s = torch.tensor(signal)
+    turns = ((s[1:-1] - s[:-2]) * (s[2:] - s[1:-1]) < 0).nonzero()[:, 0] + 1  # extremes, half a period apart
+    assert len(turns) >= 4
+    kept = float((s[turns[3]] / s[turns[1]]).abs())
+    assert kept == pytest.approx(math.exp(-math.pi * loss), rel=0.08)
+
+
+def test_maxwell_branches_take_no_momentum_and_carry_no_load():
+    p, dx = block((0.2, 0.1, 0.3)), 0.025
+    modulus, rate = maxwell_branches(0.3, 100.0)
+    p = mpm.with_branches(p, torch.tensor([modulus]).repeat(len(p), 1), torch.tensor([rate]).repeat(len(p), 1))
+    r = p.x - p.x.mean(0)
+    p.v = torch.tensor([0.5, -0.3, 0.2]) + torch.linalg.cross(torch.tensor([3.0, 5.0, -4.0]).expand_as(r), r) + 4 * r
+    solver = mpm.Solver(p, FREE, dx)
+    roll(solver, 0.02)
+    before = momenta(solver.particles, dx)
+    roll(solver, 0.3)
+    for a, b in zip(before, momenta(solver.particles, dx), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=2e-4 * float(a.norm()))
+    spun = energy(solver.particles, dx)
+    roll(solver, 1.0)  # it spins on at a constant stretch, to which the branches are relaxed
+    assert energy(solver.particles, dx) == pytest.approx(spun, rel=0.03)
+    assert float(solver.particles.branch_strain.abs().max()) < 0.03
 
 
 def test_a_block_rests_on_the_floor():

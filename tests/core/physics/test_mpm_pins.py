@@ -10,7 +10,7 @@ import warp as wp
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.pins import PinnedNodes, pin_nodes
-from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
+from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR, Features
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.pins import OUTSIDE, face_nodes
@@ -170,7 +170,7 @@ def test_the_schedule_for_gpus_gives_the_same_motion_of_what_is_pinned_and_repea
 
     def run(kind):
         solver = solver_of(p, dx, device)
-        shared = solver.rows, False, False, solver._body_contact(p, [len(p)], None)
+        shared = solver.rows, Features(False, False, False), solver._body_contact(p, [len(p)], None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         ends = []
         for held in (p.rest[:, 0] < 0, p.rest[:, 0] < 0.1):

@@ -1,7 +1,12 @@
 """Constitutive models: Kirchhoff stress and plastic flow (return mapping) of particles.
 
 `material_update` takes a trial deformation gradient and returns its elastic part after plastic flow, Kirchhoff stress
-and the new state variable. Kelvin-Voigt damping, eta (dv/dx + transpose), is added by the transfers for all models.
+and the new state variable. Kelvin-Voigt damping, eta (dv/dx + transpose), is added by the transfers for all models, and
+so are two Maxwell branches, if any particle has them: springs of `branch_modulus` times the elastic moduli, each in
+series with a damper that relaxes it at `branch_rate` [1/s]. `branch_strain` is the left Cauchy-Green tensor b of each
+spring less the identity, in which its stress is linear (Reese and Govindjee 1998, "A theory of finite viscoelasticity
+and numerical aspects", near equilibrium). The branches dissipate alike at all frequencies between their rates
+(maxwell_branches), and the substep that is stable depends on their stiffness, not on their viscosity.
 
 | model       | elastic law                   | plastic (3 numbers)                                | state       |
 | NEO_HOOKEAN | mu (F F^T - I) + lambda log J | -                                                  | -           |
@@ -21,6 +26,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -29,6 +35,8 @@ NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
 MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
 MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
 MAX_STIFFENING = (1.0, 1.0, 1.0, 1.0, MAX_SNOW_HARDENING)  # largest factor on the stiffness, by model
+MAX_LOSS = 0.6  # of two Maxwell branches: with .7 they are eight times as stiff as the spring that does not relax
+BRANCH_RATIO = 10.0  # of the branches' relaxation times
 RESIDUAL_STRENGTH = 0.1  # minimum yield stress after softening, as a fraction of the initial one
 
 
@@ -47,6 +55,22 @@ def neo_hookean(F: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
     J = wp.max(wp.determinant(F), MIN_VOLUME_RATIO)
     one = wp.identity(n=3, dtype=float)
     return stiffness[0] * (F * wp.transpose(F) - one) + stiffness[1] * wp.log(J) * one
+
+
+@wp.func
+def branch_update(e: wp.mat33, C: wp.mat33, rate: float, dt: float) -> wp.mat33:
+    """The strain e = b - I of a Maxwell branch after `dt` [s] of the velocity gradient `C`.
+
+    e' = C b + b C^T - rate e, with an implicit step for the relaxation, which is stable for any rate.
+    """
+    half = C + C * e
+    return (e + dt * (half + wp.transpose(half))) / (1.0 + dt * rate)
+
+
+@wp.func
+def branch_stress(e: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
+    """Kirchhoff stress of a strain e = b - I: neo_hookean to first order in it."""
+    return stiffness[0] * e + 0.5 * stiffness[1] * wp.trace(e) * wp.identity(n=3, dtype=float)
 
 
 @wp.func
@@ -173,6 +197,21 @@ def material_update(
         t = 2.0 * mu * e + wp.vec3(trace, trace, trace)
     out.tau = U * wp.diag(t) * wp.transpose(U)
     return out
+
+
+def maxwell_branches(loss: float, omega: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Moduli, over the elastic ones, and relaxation rates [1/s] of two branches with a loss factor tan(delta) = `loss`.
+
+    It is exact at the angular frequencies omega [rad/s] and omega / BRANCH_RATIO. Between them it is at most 1.1 times
+    as large for a loss up to .3, and 1.3 times for MAX_LOSS; at 2 omega and at half the lower frequency .6 to .8 times.
+    Raises ValueError for a loss above MAX_LOSS.
+    """
+    if not 0 <= loss <= MAX_LOSS:
+        raise ValueError(f"a loss factor of {loss:g} is not between 0 and {MAX_LOSS:g}")
+    rates = np.array([omega, omega / BRANCH_RATIO])
+    x = rates[:, None] / rates  # of row's frequency and column's branch
+    fast, slow = np.linalg.solve((x - loss * x**2) / (1 + x**2), np.full(2, loss))
+    return (float(fast), float(slow)), (float(rates[0]), float(rates[1]))
 
 
 def sand_slope(degrees: float) -> float:

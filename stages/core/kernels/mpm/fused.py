@@ -34,6 +34,7 @@ from stages.core.kernels.mpm.nodes import gather_momentum, mat43
 from stages.core.kernels.mpm.transfers import (
     FREE,
     LOST,
+    Features,
     ParticleArrays,
     ParticleUpdate,
     Substep,
@@ -41,6 +42,7 @@ from stages.core.kernels.mpm.transfers import (
     advance_kinematic,
     affine_momentum,
     mark_lost,
+    relax,
 )
 
 THREADS_PER_BLOCK = 128
@@ -128,12 +130,12 @@ def _at_sides(grid: MpmGrid, base: wp.vec3i) -> bool:
 
 
 @cache
-def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: bool) -> wp.Kernel:
+def fused_step(features: Features, has_obstacles: bool, exact: bool) -> wp.Kernel:
     """Build the kernel with the features needed, since each one costs registers.
 
-    `plastic`: material models other than neo-Hookean; `exact`: grids in fixed point (see `exact`).
+    `exact`: grids in fixed point (see `exact`).
     """
-
+    plastic, viscoelastic, restitution = features
     # 80 registers per thread instead of 94 and a quarter more threads at once; fixed point needs more registers
     bounds = {} if exact else {"launch_bounds": (THREADS_PER_BLOCK, 6)}
     collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, scatter_float)
@@ -198,6 +200,8 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
                 rows.state[i] = new.state
             else:
                 now.tau = neo_hookean(now.F, stiffness)
+            if wp.static(viscoelastic):
+                now.tau += relax(rows, i, now, stiffness, wp.where(step.gather > 0, dt, 0.0))
             if step.gather > 0:
                 rows.x[i] = now.x
                 rows.F[i] = now.F

@@ -31,6 +31,7 @@ from stages.core.kernels.mpm.nodes import gather_nodes, velocity_from_momentum
 from stages.core.kernels.mpm.transfers import (
     FREE,
     LOST,
+    Features,
     ParticleArrays,
     ParticleUpdate,
     Substep,
@@ -38,6 +39,7 @@ from stages.core.kernels.mpm.transfers import (
     advance_kinematic,
     affine_momentum,
     mark_lost,
+    relax,
 )
 
 
@@ -51,11 +53,12 @@ class ParticlePart:
 
 
 @cache
-def particle_step(plastic: bool, restitution: bool, exact: bool = False) -> wp.Kernel:
-    """Build the particle kernel; `plastic`: with material models other than neo-Hookean.
+def particle_step(features: Features, exact: bool = False) -> wp.Kernel:
+    """Build the particle kernel with these features.
 
     `exact`: it scatters in fixed point, and lists active blocks instead of setting `stale`.
     """
+    plastic, viscoelastic, restitution = features
     add = scatter_exact if exact else scatter_float
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -92,6 +95,8 @@ def particle_step(plastic: bool, restitution: bool, exact: bool = False) -> wp.K
                 rows.state[i] = new.state
             else:
                 now.tau = neo_hookean(now.F, stiffness)
+            if wp.static(viscoelastic):
+                now.tau += relax(rows, i, now, stiffness, wp.where(step.gather > 0, dt, 0.0))
             if step.gather > 0:
                 rows.x[i] = now.x
                 rows.v[i] = now.v

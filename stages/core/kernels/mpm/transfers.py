@@ -12,10 +12,13 @@ particle-in-cell method" (RPIC damping).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 from torch import Tensor
 
+from stages.core.kernels.mpm.constitutive import branch_stress, branch_update
 from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, first_node, stencil_inside
 from stages.core.kernels.mpm.nodes import mat43
 
@@ -23,6 +26,14 @@ KINEMATIC_MASS_FACTOR = 1e4  # mass factor of kinematic particles on the grid, s
 # values of `held`: moved by the grid, by its own velocity, or outside the grid; or as KINEMATIC, but not on the grid,
 # where the velocities of nodes are set instead (pins.py)
 FREE, KINEMATIC, LOST, PINNED = 0, 1, 2, 3
+
+
+class Features(NamedTuple):
+    """What the particles of a kernel need beside neo-Hookean elasticity."""
+
+    plastic: bool  # other material models
+    viscoelastic: bool  # Maxwell branches
+    restitution: bool  # of floor, walls or obstacles
 
 
 @wp.struct
@@ -43,6 +54,9 @@ class ParticleArrays:
     model: wp.array[wp.int8]  # see constitutive.py, also for `plastic` and `state`
     plastic: wp.array[wp.vec3]
     state: wp.array[float]
+    branch_modulus: wp.array[wp.vec2]  # see constitutive.py, also for `branch_rate` and `branch_strain`
+    branch_rate: wp.array[wp.vec2]  # [1/s]
+    branch_strain: wp.array2d[wp.mat33]
     acceleration: wp.array[wp.vec3]  # of external forces [m/s^2]
     scene: wp.array[int]
     order: wp.array[int]  # original row
@@ -148,6 +162,19 @@ def affine_momentum(
                     A[0, 2], A[1, 2], A[2, 2], 0.0)  # fmt: skip
 
 
+@wp.func
+def relax(rows: ParticleArrays, i: int, now: ParticleUpdate, stiffness: wp.vec3, dt: float) -> wp.mat33:
+    """Kirchhoff stress [Pa] of the Maxwell branches of particle i, whose strains are advanced by `dt` [s]."""
+    modulus = rows.branch_modulus[i]
+    rate = rows.branch_rate[i]
+    together = wp.mat33()
+    for n in range(2):
+        e = branch_update(rows.branch_strain[i, n], now.C, rate[n], dt)
+        rows.branch_strain[i, n] = e
+        together += modulus[n] * e
+    return branch_stress(together, stiffness)
+
+
 @wp.kernel(enable_backward=False)
 def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
     """Sort keys by scene, block, and cell within the block, for memory locality; lost particles come last."""
@@ -166,8 +193,8 @@ def substep_reference(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """One substep of `dt` [s] of free neo-Hookean particles in PyTorch: specification of the kernels.
 
-    rows: x, v, C, F, mass, volume, stiffness and acceleration, as in ParticleArrays; `friction` of floor and walls.
-    Returns x, v, C, F.
+    rows: x, v, C, F, mass, volume, stiffness, acceleration and the columns of Maxwell branches, if there are any, as in
+    ParticleArrays; `friction` of floor and walls. Returns x, v, C, F.
     """
     v, C, F, mass, volume, stiffness = (rows[k] for k in ("v", "C", "F", "mass", "volume", "stiffness"))
     dx, nodes, origin = grid.dx, tuple(grid.nodes), torch.tensor(list(grid.origin)).to(v)
@@ -185,6 +212,9 @@ def substep_reference(
     J = torch.linalg.det(F).clamp_min(0.05)
     tau = stiffness[:, 0, None, None] * (F @ F.mT - one) + (stiffness[:, 1] * J.log())[:, None, None] * one
     tau = tau + stiffness[:, 2, None, None] * (C + C.mT)
+    e = (rows["branch_modulus"][..., None, None] * rows["branch_strain"]).sum(1)
+    trace = e.diagonal(dim1=1, dim2=2).sum(1)
+    tau = tau + stiffness[:, 0, None, None] * e + (stiffness[:, 1] * trace / 2)[:, None, None] * one
     A = mass[:, None, None] * C - (dt * volume * 4 / dx**2)[:, None, None] * tau
     momentum = (mass[:, None] * (v + dt * rows["acceleration"]))[:, None] + torch.einsum("pab,pnb->pna", A, offset)
     count = nodes[0] * nodes[1] * nodes[2]

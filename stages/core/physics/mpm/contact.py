@@ -15,7 +15,7 @@ from stages.core.kernels.mpm.contact import NONE, REFRESH, find_nearest
 from stages.core.kernels.mpm.grid import NodeArrays
 from stages.core.kernels.mpm.pins import pin_nodes
 from stages.core.kernels.mpm.split import ParticlePart, particle_step
-from stages.core.kernels.mpm.transfers import substep
+from stages.core.kernels.mpm.transfers import Features, substep
 from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.graphs import SORT_INTERVAL, GraphedFrames
 from stages.core.physics.mpm.particle_rows import ParticleRows
@@ -25,11 +25,9 @@ from stages.core.physics.mpm.pins import Pins
 class ContactSubsteps(GraphedFrames):
     """Runs the substeps of a frame; the scenes of `rows` are bodies in contact. Parameters as in SplitSubsteps."""
 
-    def __init__(
-        self, rows: ParticleRows, plastic: bool, bouncy: bool, contact: BodyContact, scale: tuple[float, float]
-    ):
+    def __init__(self, rows: ParticleRows, features: Features, contact: BodyContact, scale: tuple[float, float]):
         super().__init__(rows, scale)
-        self._step, self._contact = particle_step(plastic, bouncy, exact=True), contact
+        self._step, self._contact = particle_step(features, exact=True), contact
         self._velocity = torch.zeros(self._count, 4, device=self.device)
         self._momentum = torch.zeros(2 * self._count, 4, device=self.device)
         self._nearest = torch.full((self._count,), int(NONE), dtype=torch.int64, device=self.device)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from stages.core.kernels.interop import launch, with_arrays
 from stages.core.kernels.mpm.fused import THREADS_PER_BLOCK, RotatingNodes, fused_step
-from stages.core.kernels.mpm.transfers import substep
+from stages.core.kernels.mpm.transfers import Features, substep
 from stages.core.physics.mpm.graphs import SORT_INTERVAL, GraphedFrames
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
@@ -15,9 +15,9 @@ from stages.core.physics.mpm.particle_rows import ParticleRows
 class FusedSubsteps(GraphedFrames):
     """Runs the substeps of a frame; parameters as in SplitSubsteps."""
 
-    def __init__(self, rows: ParticleRows, plastic: bool, bouncy: bool, scale: tuple[float, float] | None = None):
+    def __init__(self, rows: ParticleRows, features: Features, scale: tuple[float, float] | None = None):
         super().__init__(rows, scale)
-        self._kernel = fused_step(plastic, self.grid.obstacles.shape[0] > 0, bouncy, scale is not None)
+        self._kernel = fused_step(features, self.grid.obstacles.shape[0] > 0, scale is not None)
         self._rotating = [torch.zeros(self._width * self._count, 4, device=self.device) for _ in range(3)]
         self._nodes = [self._roles(step) for step in range(3)]
 

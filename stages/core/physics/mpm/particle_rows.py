@@ -14,7 +14,8 @@ from stages.core.kernels.mpm import transfers as kernels
 NEVER = 2**31 - 1  # value of `lost` for a scene without lost particles
 _TYPES = {
     "x": wp.vec3, "rest": wp.vec3, "v": wp.vec3, "C": wp.mat33, "F": wp.mat33, "stiffness": wp.vec3, "plastic": wp.vec3,
-    "acceleration": wp.vec3, "base_node": wp.vec3i,
+    "acceleration": wp.vec3, "base_node": wp.vec3i, "branch_modulus": wp.vec2, "branch_rate": wp.vec2,
+    "branch_strain": wp.mat33,
 }  # fmt: skip
 
 
@@ -40,7 +41,8 @@ class ParticleRows:
         self.struct = kernels.ParticleArrays()
         self.struct.count = p
         for name, t in self.tensors.items():
-            setattr(self.struct, name, view(t, _TYPES.get(name)))
+            if t.numel():  # particles without Maxwell branches have none of these columns
+                setattr(self.struct, name, view(t, _TYPES.get(name)))
         self.struct.lost = view(self.lost)
 
     def __len__(self) -> int:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_STIFFENING, NEO_HOOKEAN
-from stages.core.kernels.mpm.transfers import KINEMATIC, PINNED
+from stages.core.kernels.mpm.transfers import KINEMATIC, PINNED, Features
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.body_shapes import BodyContact, BodyShape, shape_of_voxels
 from stages.core.physics.mpm.contact import ContactSubsteps
@@ -69,6 +69,10 @@ class Particles:
     model: Int[Tensor, "p"]  # number of the material model, see core/kernels/mpm/constitutive.py
     plastic: Float[Tensor, "p 3"]  # parameters of the material model
     state: Float[Tensor, "p"]  # internal variable of the material model; initially 0
+    # Maxwell branches, none (b = 0) or two; see core/kernels/mpm/constitutive.py
+    branch_modulus: Float[Tensor, "p b"]  # over the elastic moduli
+    branch_rate: Float[Tensor, "p b"]  # relaxation [1/s]
+    branch_strain: Float[Tensor, "p b 3 3"]  # left Cauchy-Green tensor of the springs, less the identity
 
     def __len__(self) -> int:
         return len(self.x)
@@ -100,7 +104,17 @@ def at_rest(
     stiffness = torch.stack([E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), viscosity], -1)
     held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)
     return Particles(x, torch.zeros(p, 3), x.clone(), still, identity, density * volume, volume, stiffness, friction,
-                     held, models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
+                     held, models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p), torch.zeros(p, 0),
+                     torch.zeros(p, 0), torch.zeros(p, 0, 3, 3))  # fmt: skip
+
+
+def with_branches(
+    particles: Particles, modulus: Float[Tensor, "p 2"], rate: Float[Tensor, "p 2"]
+) -> Particles:  # fmt: skip
+    """The same with two relaxed Maxwell branches of these moduli, over the elastic ones, and relaxation rates [1/s]."""
+    return replace(
+        particles, branch_modulus=modulus, branch_rate=rate, branch_strain=torch.zeros(len(modulus), 2, 3, 3)
+    )
 
 
 def join_particles(parts: Sequence[Particles]) -> Particles:
@@ -192,17 +206,19 @@ class Solver:
         self.grid.damping, self.grid.obstacles = options.damping, as_obstacles(self.colliders, device)
         self._rates = self._max_rates()
         self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
-        plastic = bool((particles.model != NEO_HOOKEAN).any())
-        bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
-        shared = self.rows, plastic, bouncy
+        features = Features(
+            plastic=bool((particles.model != NEO_HOOKEAN).any()),
+            viscoelastic=particles.branch_modulus.shape[1] > 0,
+            restitution=any(surface.restitution > 0 for surface in (box, *self.colliders)),
+        )
         quanta = self._quanta() if exact else None
         contact = self._body_contact(particles, sizes, options.shapes) if schedule == "contact" else None
         if fused:
-            self._substepper = FusedSubsteps(*shared, quanta)
+            self._substepper = FusedSubsteps(self.rows, features, quanta)
         elif exact:
-            self._substepper = ContactSubsteps(*shared, contact, quanta)
+            self._substepper = ContactSubsteps(self.rows, features, contact, quanta)
         else:
-            self._substepper = SplitSubsteps(*shared, contact)
+            self._substepper = SplitSubsteps(self.rows, features, contact)
         self._bodies = schedule == "contact"
         self._pin()
         self._substep_multiple = SUBSTEP_MULTIPLE if device != "cpu" and (fused or exact) else 1
@@ -223,7 +239,7 @@ class Solver:
         """Overwrite fields of all particles, in the original order."""
         for name, value in changes.items():
             self.rows.put(name, value)
-        if {"mass", "stiffness", "held"} & changes.keys():
+        if {"mass", "stiffness", "held", "branch_modulus"} & changes.keys():
             self._rates = self._max_rates()
         if "held" in changes:
             self._pin()
@@ -299,6 +315,7 @@ class Solver:
         density = (self.rows["mass"] / self.rows["volume"])[moving]
         mu, lam, eta = self.rows["stiffness"][moving].unbind(1)
         stiffening = torch.tensor(MAX_STIFFENING, device=mu.device)[self.rows["model"][moving].long()]
+        stiffening = stiffening + self.rows["branch_modulus"][moving].sum(1)
         return float((stiffening * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
 
 

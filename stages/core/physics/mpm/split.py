@@ -18,7 +18,7 @@ from stages.core.kernels.mpm.active import ActiveBlocks
 from stages.core.kernels.mpm.contact import NONE, REFRESH, STATIC_REACH, TouchingBlocks, contact_step, find_nearest
 from stages.core.kernels.mpm.grid import NodeArrays
 from stages.core.kernels.mpm.pins import pin_nodes
-from stages.core.kernels.mpm.transfers import substep
+from stages.core.kernels.mpm.transfers import Features, substep
 from stages.core.kernels.threads import run_parallel
 from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.particle_rows import ParticleRows
@@ -32,16 +32,15 @@ MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch i
 class SplitSubsteps:
     """Runs the substeps of a frame for the particles in `rows`.
 
-    `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces. With
-    `contact` the scenes of `rows` are bodies in contact with each other.
+    With `contact` the scenes of `rows` are bodies in contact with each other.
     """
 
-    def __init__(self, rows: ParticleRows, plastic: bool, bouncy: bool, contact: BodyContact | None = None):
+    def __init__(self, rows: ParticleRows, features: Features, contact: BodyContact | None = None):
         self._contact, self._contact_commands, self._refresh = contact, [], True
         self._pins, self._pin_commands = None, []
         self.rows, self.grid, self.device = rows, rows.grid, rows.device
         self.parts = CPU_PARTS if self.device == "cpu" else 1
-        self._step = kernels.particle_step(plastic, bouncy)
+        self._step = kernels.particle_step(features)
         self._count = rows.scenes * self.grid.count
         self._velocity = _lazy_zeros((self._count, 4), self.device)
         self._momentum = _lazy_zeros((self.parts * self._count, 4), self.device)

@@ -114,14 +114,16 @@ def with_objects(scene: Scene, path: Path, seed: int = 0, device: str = "auto") 
         means = scene.gaussians.means[scene.gaussians.object_id == o.id].double()
         if not len(means):
             log.warning("object %d (%s) has no Gaussians and is skipped", o.id, o.name)
-        elif float((means.amax(0) - means.amin(0)).max()) <= MIN_EXTENT * float(means.abs().max()):
-            log.warning("object %d (%s) is a point (%d Gaussians) and is skipped", o.id, o.name, len(means))
+        elif (extent := float((means.amax(0) - means.amin(0)).max())) <= MIN_EXTENT * float(means.abs().max()):
+            why = "too far from the origin for its size" if extent else "a point"
+            log.warning("object %d (%s) is %s (%d Gaussians) and is skipped", o.id, o.name, why, len(means))
         else:
             present.append(o)
     if present:
         return replace(scene, objects=tuple(present))
     if scene.gaussians.object_id.any():
-        raise InputError(f"{path}: its objects are points, which cannot be simulated; label it with `ngff segment`")
+        raise InputError(f"{path}: its objects are points, or too far from the origin for their size, and cannot be "
+                         "simulated; label it with `ngff segment`, or move the scene to the origin")  # fmt: skip
     from stages.core.models.segmenter.segment import segment_by_network  # noqa: PLC0415 -- only unlabelled scenes need it
 
     grouped = segment_by_network(scene, seed=seed, device=pick_device(device))

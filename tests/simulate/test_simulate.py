@@ -285,6 +285,10 @@ def test_objects_without_extent_are_left_out(balls, caplog):
     only = scene.gaussians[scene.gaussians.object_id == 2]
     with pytest.raises(InputError, match="its objects are points"):
         with_objects(replace(scene, gaussians=only), Path("scene.ply"))
+    far = replace(scene, gaussians=replace(scene.gaussians, means=scene.gaussians.means + 1e6))
+    with pytest.raises(InputError, match="move the scene to the origin"):
+        with_objects(far, Path("scene.ply"))
+    assert "object 1 (red ball) is too far from the origin for its size" in caplog.text
 
 
 def test_frames_of_thousands_of_steps_of_the_learned_field_are_refused(balls):

@@ -49,17 +49,20 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
 def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
     """At most `count` keypoints per object, farthest-point samples of its usable Gaussians without outliers.
 
-    Objects without Gaussians get none.
+    Objects without Gaussians get none; those of which only a point would be left keep the other Gaussians.
     """
     g = scene.gaussians.to("cpu")
     good = usable(g)
 
     def pick(id: int) -> Float[Tensor, "k 3"]:
         mine = g.object_id == id
-        means = g.means[mine & good] if bool((mine & good).any()) else g.means[mine & g.means.isfinite().all(1)]
+        means = g.means[mine & good]
+        if _is_point(means):
+            means = g.means[mine & g.means.isfinite().all(1)]
         if not len(means):
             return means
-        means = means[inliers(means)]
+        body = means[inliers(means)]
+        means = means if _is_point(body) else body
         if len(means) > MAX_CANDIDATES:
             order = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))
             means = means[order[:MAX_CANDIDATES]]
@@ -68,6 +71,11 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
     picked = parallel_map(pick, [o.id for o in scene.objects])
     ids = [torch.full((len(rest),), o.id) for o, rest in zip(scene.objects, picked, strict=True)]
     return Keypoints(torch.cat([torch.zeros(0, 3), *picked]), torch.cat([torch.zeros(0, dtype=torch.int64), *ids]))
+
+
+def _is_point(means: Float[Tensor, "k 3"]) -> bool:
+    """Whether these have no extent, as one or none has, so that no size and no rotation can be told from them."""
+    return not bool((means != means[:1]).any())
 
 
 def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:

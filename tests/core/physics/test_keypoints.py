@@ -73,6 +73,14 @@ def test_objects_without_usable_gaussians_have_keypoints_where_these_are():
     assert len(choose_keypoints(scene(replace(nowhere, object_id=torch.ones(3, dtype=torch.int64))), 8).rest) == 0
 
 
+def test_an_object_is_not_reduced_to_a_point():
+    """Of two Gaussians one would be an outlier, and of three here only one is usable."""
+    pair = splats(torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
+    three = splats(torch.tensor([[2.0, 0, 0], [3, 0, 0], [4, 0, 0]]))
+    three = replace(three, opacities=torch.tensor([0.0, 0.9, 0.0]), object_id=torch.full((3,), 2))
+    assert choose_keypoints(scene(pair, three), 8).object_id.tolist() == [1, 1, 2, 2, 2]
+
+
 def test_of_many_gaussians_some_are_candidates(monkeypatch):
     monkeypatch.setattr(module, "MAX_CANDIDATES", 50)
     g = splats(torch.rand(500, 3, generator=torch.Generator().manual_seed(0)))

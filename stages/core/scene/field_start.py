@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.h5_schema import Dataset, attribute
 from stages.core.scene.h5_text import check_attributes
 from stages.core.scene.schema import number, numbers, quote, whole
 
@@ -98,12 +98,13 @@ def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | N
     values = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else tuple(quote(s, 40) for s in v)
               for k, v in read.items()}  # fmt: skip
     check_attributes(file[GROUP])
-    attributes = file[GROUP].attrs
-    factors = {name: number(attributes[name], name, 1e-12, 1e12) for name in ("length", "scale", "time", "mass")}
-    friction = number(attributes["friction"], "friction", 0, 100) if "friction" in attributes else None
+    group = file[GROUP]
+    factors = {name: number(attribute(group, name), name, 1e-12, 1e12) for name in ("length", "scale", "time", "mass")}
+    friction = number(attribute(group, "friction"), "friction", 0, 100) if "friction" in group.attrs else None
     units = FieldUnits(
-        **factors, origin=numbers(attributes["origin"], 3, "origin"), gravity=number(attributes["gravity"], "gravity"),
-        steps=whole(attributes["steps"], "steps", 1, 10_000), weights=quote(str(attributes["weights"]), 64),
+        **factors, origin=numbers(attribute(group, "origin"), 3, "origin"),
+        gravity=number(attribute(group, "gravity"), "gravity"),
+        steps=whole(attribute(group, "steps"), "steps", 1, 10_000), weights=quote(attribute(group, "weights"), 64),
         friction=friction,
     )  # fmt: skip
     return FieldStart(**values, units=units)

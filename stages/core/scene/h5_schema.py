@@ -40,6 +40,20 @@ def find_link(file: h5py.File, name: str) -> h5py.HardLink | h5py.SoftLink | h5p
     return link
 
 
+def attribute(item: h5py.Group | h5py.Dataset, name: str, *default: object) -> object:
+    """The value of an attribute, or `default`; KeyError where it is absent and there is no default.
+
+    Texts of fixed length become str, and arrays of one value that value: C and MATLAB write such ones.
+    """
+    if name not in item.attrs:
+        if not default:
+            raise KeyError(f"attribute {name}")
+        return default[0]
+    value = item.attrs[name]
+    value = value.item() if isinstance(value, (np.ndarray, np.generic)) and value.size == 1 else value
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Expected shape, type and range of a dataset. A letter in the shape stands for the same length in all datasets."""

@@ -21,7 +21,7 @@ from stages.core.scene.field_start import FieldStart, read_field_start, write_fi
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.h5_chunks import COMPRESSED, append_rows, read_compressed, write_compressed
-from stages.core.scene.h5_schema import Dataset, find_link, open_h5
+from stages.core.scene.h5_schema import Dataset, attribute, find_link, open_h5
 from stages.core.scene.prompt_rows import read_prompts
 from stages.core.scene.scene import Scene, read_metadata, read_objects
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
@@ -272,11 +272,11 @@ def read_trajectory(path: Path) -> Trajectory:
     must_exist(path, EXPECTED)
     try:
         with open_h5(path) as file:
-            kind = file.attrs.get("format", "")
+            kind = attribute(file, "format", "")
             if kind != FORMAT:
                 kind = quote(repr(kind))
                 raise InputError(f"{path}: its format attribute is {kind}, not {FORMAT!r}; {EXPECTED} is expected")
-            version = number(file.attrs["version"], "version", 0)
+            version = number(attribute(file, "version"), "version", 0)
             if version > VERSION:
                 raise InputError(f"{path}: version {version:g} is newer than {VERSION}; upgrade ngff")
             return _read(path, file)
@@ -326,16 +326,15 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     if has("cameras/viewmats"):
         *matrices, names = (values(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes", "names"))
         cameras = check_cameras(Cameras(*matrices, tuple(quote(name, 255) for name in names)))
-    attributes = file.attrs
-    scale = parse_json(str(attributes.get("scale", '{"metres_per_unit": 1.0, "source": "not stated"}')))
-    made_by = parse_json(str(attributes.get("provenance", "{}")), finite=False)
-    metadata = read_metadata(attributes.get("floor"), scale, made_by, attributes.get("background"))
+    scale = parse_json(str(attribute(file, "scale", '{"metres_per_unit": 1.0, "source": "not stated"}')))
+    made_by = parse_json(str(attribute(file, "provenance", "{}")), finite=False)
+    metadata = read_metadata(attribute(file, "floor", None), scale, made_by, attribute(file, "background", None))
     scene = Scene(gaussians, objects, cameras, **metadata)
     texts = values("forces/json") if has("forces/json") else []
     forces = read_prompts(map(parse_json, texts), ids)
-    dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
-    info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
-    measures = _read_plausibility(parse_json(str(attributes.get("plausibility", "{}"))))
+    dt, gravity = number(attribute(file, "dt"), "dt", 1e-6, 1e4), numbers(attribute(file, "gravity"), 3, "gravity")
+    info = SimulationInfo(dt, gravity, quote(attribute(file, "engine")), forces)
+    measures = _read_plausibility(parse_json(str(attribute(file, "plausibility", "{}"))))
     confidence = values("objects/confidence") if has("objects/confidence") else None
     return Trajectory(
         scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths), confidence, measures

@@ -204,6 +204,22 @@ def change(path, intact: bytes, name: str, value) -> None:
             where[name] = value
 
 
+def test_attributes_are_read_as_other_languages_write_them(tmp_path, intact):
+    """Texts of fixed length, as C and MATLAB write them, and arrays of one number."""
+    path = tmp_path / "t.h5"
+    path.write_bytes(intact)
+    expected = read_trajectory(path)
+    with h5py.File(path, "a") as file:
+        for name in ("format", "engine", "scale", "provenance"):
+            file.attrs[name] = np.bytes_(file.attrs[name])
+        for name in ("version", "dt"):
+            file.attrs[name] = np.array([file.attrs[name]])
+        file.attrs["engine"] = np.array([file.attrs["engine"]])
+    found = read_trajectory(path)
+    assert found.info == expected.info and found.scene.scale == expected.scene.scale
+    assert found.scene.provenance == expected.scene.provenance
+
+
 @pytest.mark.parametrize(("name", "value", "message"), [
     ("version", 2, "version 2 is newer than 1; upgrade"), ("version", -1, "version is"), ("dt", 0.0, "dt is"),
     ("dt", None, "missing"), ("gravity", [0.0, 1.0], "gravity is"), ("floor", np.inf, "floor is"),

@@ -66,6 +66,8 @@ def _load(path: Path) -> list:
         raise InputError(f"{path}: cannot be read as a mesh ({error}); export it again") from error
     if not meshes:
         raise InputError(f"{path}: holds no triangles; a mesh with faces is needed (this may be a point cloud)")
+    if any(m.vertices.shape[1] != 3 for m in meshes):
+        raise InputError(f"{path}: has vertices without three coordinates; export it again as a mesh in space")
     if not all(np.isfinite(m.triangles).all() for m in meshes):
         raise InputError(f"{path}: has vertices that are not finite; repair the mesh or export it again")
     return meshes
@@ -117,7 +119,8 @@ def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Floa
     image = next((image for image in images if image is not None), None)
     if image is None or getattr(visual, "uv", None) is None:
         return _material_colour(material).expand(len(face), 3)
-    uv = torch.from_numpy(np.array(visual.uv, np.float32))
+    uv = np.pad(np.array(visual.uv, np.float32), ((0, 0), (0, 1)))[:, :2]  # OBJ allows u alone
+    uv = torch.from_numpy(np.where(np.abs(uv) < 1e6, uv, 0))  # NaN, as exporters give faces without area, is 0 too
     texels = torch.from_numpy(np.array(image.convert("RGB"), np.float32) / 255)
     tint = _material_colour(material) if getattr(material, "baseColorFactor", None) is not None else torch.ones(3)
     return _bilinear_lookup(texels, (uv[corner] * weight[..., None]).sum(1)) * tint

@@ -310,13 +310,25 @@ def test_missing_textures_leave_the_colour_of_the_material(tmp_path):
         torch.testing.assert_close(rgb(g).mean(0), torch.tensor(colour), rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("corners", ["vt 0.25\nvt 0.25\nvt 0.25", "vt nan 0\nvt inf 0\nvt 3e38 0"])
+def test_odd_texture_coordinates_are_read(tmp_path, corners):
+    """OBJ allows one coordinate; those that are no place in the texture count as 0."""
+    write_png(tmp_path / "paint.png", torch.tensor([0.8, 0.4, 0.2]).expand(4, 4, 3).contiguous())
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd paint.png\n")
+    text = f"mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{corners}\nusemtl skin\nf 1/1 2/2 3/3\n"
+    (tmp_path / "one.obj").write_text(text)
+    g = read_mesh(tmp_path / "one.obj", 200, light=False)
+    torch.testing.assert_close(rgb(g).mean(0), torch.tensor([0.8, 0.4, 0.2]), rtol=0, atol=0.01)
+
+
 @pytest.mark.parametrize(("text", "words"), [
+    ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "three coordinates"),
     ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no area"),
     ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "no area"),
     ("v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
     ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read as a mesh"),
     ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no triangles|cannot be read as a mesh"),
-], ids=["line", "point", "nan", "index", "faces"])  # fmt: skip
+], ids=["flat", "line", "point", "nan", "index", "faces"])  # fmt: skip
 def test_meshes_without_a_surface_are_rejected(tmp_path, text, words):
     (tmp_path / "bad.obj").write_text(text)
     with pytest.raises(InputError, match=rf"bad\.obj: .*({words})"):

@@ -93,10 +93,10 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; --library takes whole objects, such as `ngff-lab objects` writes")
-    files = {p.stem: p for p in sorted(folder.glob("*.ply"))}
-    files.update(
-        {p.relative_to(folder).parts[0]: p for p in sorted(folder.glob("*/**/*.ply"))}
-    )  # the last one of each, by path
+    found = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".ply" and not p.name.startswith("."))
+    files = {p.stem: p for p in found if p.parent == folder}
+    # the last one of each, by path
+    files.update({p.relative_to(folder).parts[0]: p for p in found if p.parent != folder})
     if not files:
         raise InputError(f"{folder}: holds no .ply; --library takes whole objects, such as `ngff-lab objects` writes")
     out = {}

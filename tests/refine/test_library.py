@@ -18,7 +18,7 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
-from stages.refine.library import transformed
+from stages.refine.library import load_library, transformed
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine, run
 from tests.conftest import random_gaussians
@@ -117,6 +117,15 @@ def test_invalid_libraries_are_refused(seen, tmp_path):
             run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions(library=folder))
     with pytest.raises(InputError, match="--library"):
         RefineOptions(completer="library")
+
+
+def test_suffixes_have_any_case_and_hidden_files_do_not_count(tmp_path):
+    (tmp_path / "duck/output").mkdir(parents=True)
+    for name in ("BALL.PLY", "duck/output/a.ply"):
+        write_scene(tmp_path / name, Scene(random_gaussians(200)))
+    (tmp_path / "._BALL.PLY").write_text("as macOS writes")
+    (tmp_path / "duck/output/._z.ply").write_text("as macOS writes")
+    assert list(load_library(tmp_path, "cpu")) == ["BALL", "duck"]
 
 
 def test_provenance_records_the_library(seen, folder, tmp_path):

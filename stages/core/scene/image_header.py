@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import NamedTuple
 
 from stages.core.scene.schema import MAX_DEFLATE_RATIO
@@ -31,6 +32,28 @@ def read_image_header(data: bytes) -> ImageHeader:
         if data.startswith(begin):
             return read(data)
     raise ValueError("no image")
+
+
+def png_of_numbers(data: bytes) -> tuple[bytes, int]:
+    """A PNG of one channel that decodes to the numbers that this one stores, times the factor that is returned.
+
+    With a palette the numbers are its indices, as annotation tools write labels. Decoders spread numbers of fewer than
+    8 bits over 0 to 255. PNGs of several channels are returned as they are, as are those with a palette of greys other
+    than their indices, of which either may be meant.
+    """
+    chunks, at = [], 8
+    while at < len(data):
+        chunks.append(data[at : at + 12 + _big(data, at, 4)])
+        at += len(chunks[-1])
+    depth, colour = data[24], data[25]
+    palette = next((c[8:-4] for c in chunks if c[4:8] == b"PLTE"), b"") if colour == 3 else b""
+    greys = palette[::3] == palette[1::3] == palette[2::3]
+    if colour not in (0, 3) or (greys and palette[::3] != bytes(range(len(palette) // 3))):
+        return data, 1
+    size = b"IHDR" + data[16:25] + b"\0" + data[26:29]
+    needed = [c for c in chunks if c[4:8] in (b"IDAT", b"IEND")]
+    head = [data[:8], data[8:12], size, zlib.crc32(size).to_bytes(4, "big")]
+    return b"".join(head + needed), {1: 255, 2: 85, 4: 17}.get(depth, 1)
 
 
 def _png(data: bytes) -> ImageHeader:

@@ -20,7 +20,7 @@ from torch import Tensor
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
-from stages.core.scene.image_header import MAX_PIXELS, read_image_header
+from stages.core.scene.image_header import MAX_PIXELS, png_of_numbers, read_image_header
 
 log = logging.getLogger(__name__)
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our errors say the same in one line
@@ -54,7 +54,9 @@ def read_8_bit(path: Path) -> UInt8[Tensor, "h w 3"]:
 
 
 def _read_rgb(path: Path) -> np.ndarray:
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
+    data = image_data(path)
+    _check_header(path, data)
+    return cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
 
 
 def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
@@ -66,22 +68,24 @@ def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
 
 
 def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
-    """A label image: one integer per pixel (8 bit, or 16 where `max_bits` allows).
+    """A label image: one integer per pixel (up to 8 bit, or 16 where `max_bits` allows), or the indices of a palette.
 
     InputError for several channels, and for JPEG, whose compression makes other numbers at the outlines.
     """
-    pixels = _decode(path, cv2.IMREAD_UNCHANGED, "a label image")
-    with Path(path).open("rb") as file:
-        lossy = file.read(2) == b"\xff\xd8"
-    if lossy:
+    data, factor = image_data(path, "a label image"), 1
+    _check_header(path, data)
+    if data.startswith(b"\xff\xd8"):
         raise InputError(f"{path}: is a JPEG, whose compression changes the numbers; save the label image as PNG")
+    if data.startswith(b"\x89PNG"):
+        data, factor = png_of_numbers(data)
+    pixels = _decode(path, data, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2:
         raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
     if pixels.dtype.kind != "u":
         raise InputError(f"{path}: has values of type {pixels.dtype}; save the label image with 8 bits, as PNG")
     if 8 * pixels.itemsize > max_bits:
         raise InputError(f"{path}: has {8 * pixels.itemsize} bits per pixel; save the label image with {max_bits}")
-    return torch.from_numpy(pixels.astype(np.int64))
+    return torch.from_numpy(pixels.astype(np.int64) // factor)
 
 
 def image_data(path: Path, what: str = "an image") -> bytes:
@@ -94,9 +98,8 @@ def image_data(path: Path, what: str = "an image") -> bytes:
     return data
 
 
-def _decode(path: Path, flags: int, what: str = "an image") -> np.ndarray:
-    """Pixels of an image file, BGR. Raises InputError for other files, and for more pixels than the file can hold."""
-    data = image_data(path, what)
+def _check_header(path: Path, data: bytes) -> None:
+    """Raises InputError for other files than images, and for more pixels than the file can hold."""
     try:
         header = read_image_header(data)
     except (ValueError, IndexError) as error:
@@ -104,6 +107,10 @@ def _decode(path: Path, flags: int, what: str = "an image") -> np.ndarray:
     if header.width * header.height > MAX_PIXELS or header.stored > len(data):
         raise InputError(f"{path}: is damaged, or far too large ({header.width}x{header.height} pixels in {len(data)} "
                          "bytes); images of 4000 pixels or less will do")  # fmt: skip
+
+
+def _decode(path: Path, data: bytes, flags: int) -> np.ndarray:
+    """Pixels of an image whose header was checked, BGR. Raises InputError for a damaged one."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

@@ -177,6 +177,34 @@ def test_label_images_have_one_channel_and_a_bounded_depth(tmp_path):
         read_labels(tmp_path / "b.png", max_bits=8)
 
 
+def png(depth: int, row: bytes, width: int, palette: bytes | None = None) -> bytes:
+    """A PNG of one row of packed pixels, grey or with a palette and the opacity of its first colour."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", width, 1, depth, 0 if palette is None else 3, 0, 0, 0))]
+    parts += [] if palette is None else [(b"PLTE", palette), (b"tRNS", b"\0")]
+    parts += [(b"IDAT", zlib.compress(b"\0" + row)), (b"IEND", b"")]
+    chunks = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+              for kind, data in parts]  # fmt: skip
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+@pytest.mark.parametrize(("depth", "row", "expected"), [
+    (1, b"\x50", [0, 1, 0, 1]), (2, b"\x1b", [0, 1, 2, 3]), (4, b"\x01\x2f", [0, 1, 2, 15]),
+    (8, b"\x00\x01\x02\x03", [0, 1, 2, 3]),
+])  # fmt: skip
+def test_label_images_of_few_bits_or_with_a_palette_hold_their_numbers(tmp_path, depth, row, expected):
+    """Decoders spread the numbers of few bits over 0 to 255, and show the colours of a palette."""
+    (tmp_path / "grey.png").write_bytes(png(depth, row, 4))
+    assert read_labels(tmp_path / "grey.png").tolist() == [expected]
+    (tmp_path / "palette.png").write_bytes(png(depth, row, 4, bytes([0, 0, 0, 200, 0, 0, 0, 200, 0] * 7)[: 3 << depth]))
+    assert read_labels(tmp_path / "palette.png").tolist() == [expected]
+
+
+def test_label_images_whose_palette_is_of_other_greys_are_ambiguous(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(8, b"\0\1", 2, bytes([0, 0, 0, 7, 7, 7])))
+    with pytest.raises(InputError, match="a.png: has [34] channels"):
+        read_labels(tmp_path / "a.png")
+
+
 def test_label_images_are_not_compressed_with_losses(tmp_path):
     labels = np.kron(np.array([[0, 1], [2, 3]], np.uint8), np.ones((20, 20), np.uint8))
     cv2.imwrite(str(tmp_path / "a.jpg"), labels)

@@ -136,7 +136,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     notes = _notes(scene, scores, rows)
     if len(spare):
         notes.append("neither asked for nor held against the result: " + ", ".join(names[int(i)].name for i in spare))
-    if absent := sorted({file.name for file in truth.glob("*.png")} - {file.name for file in files.values()}):
+    if absent := sorted({file.name for file in _label_images(truth)} - {file.name for file in files.values()}):
         notes.append(f"label images of photos that the scene has no camera for: {', '.join(absent)}")
     result = Result("labels", {**scores.summary(), "photos": len(files)}, parts, notes)
     colours = LabelColours.of(scores.iou, scores.hits)
@@ -159,11 +159,17 @@ def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict
     """The label image NAME.png of each camera's photo NAME that has one; InputError where none has."""
     if cameras is None or not len(cameras):
         raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
-    paths = {i: folder / f"{Path(name).stem}.png" for i, name in enumerate(cameras.names)}
-    files = {i: path for i, path in paths.items() if path.exists()}
+    images = {path.stem: path for path in _label_images(folder)}
+    stems = [Path(name).stem for name in cameras.names]
+    files = {i: images[stem] for i, stem in enumerate(stems) if stem in images}
     if not files:
-        raise InputError(f"{folder}: no label image is named as a photo of {prediction}, such as {paths[0].name}")
+        raise InputError(f"{folder}: no label image is named as a photo of {prediction}, such as {stems[0]}.png")
     return files
+
+
+def _label_images(folder: Path) -> list[Path]:
+    """The PNG files of a folder, without hidden ones, sorted by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() == ".png" and not p.name.startswith("."))
 
 
 def read_truth(file: Path, cameras: Cameras, view: int, undistorted: bool = False) -> Int[Tensor, "h w"]:

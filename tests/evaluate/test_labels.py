@@ -188,6 +188,14 @@ def test_label_image_of_the_undistorted_view(labelled):
     assert evaluate(labelled, undistorted=True)["objects"]["duck"]["IoU"] > 0.94
 
 
+def test_suffixes_have_any_case_and_hidden_files_do_not_count(labelled):
+    expected = evaluate(labelled)
+    (labelled / "labels/a.b.png").rename(labelled / "labels/a.b.PNG")
+    (labelled / "labels/._a.b.PNG").write_text("as macOS writes")
+    facts = evaluate(labelled)
+    assert facts["objects"] == expected["objects"] and facts["notes"] == expected["notes"]
+
+
 def write_colour(path: Path) -> None:
     cv2.imwrite(str(path), np.zeros((*SIZE[::-1], 3), np.uint8))
 

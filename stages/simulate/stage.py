@@ -54,6 +54,7 @@ def run(
     if options.forces is not None:
         stored = read_prompts_file(options.forces, Path(scene).stem, world.objects)
     prompts = forces.parse(world.objects, options.force, options.pin, options.velocity, options.lift, stored)
+    _tell_of_idle_prompts(prompts, world, options)
     keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     options = with_engine(options, world, keypoints, prompts)
     prompts = for_engine(prompts, world, options)
@@ -85,6 +86,17 @@ def run(
     if max_displacement < 0.02 * size and not prompts:
         log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
+
+
+def _tell_of_idle_prompts(prompts: forces.ForcePrompts, scene: Scene, options: SimulateOptions) -> None:
+    """Warn of prompts that contradict others or the length of the simulation, and so change nothing."""
+    for id in sorted(prompts.pinned & prompts.velocity.keys()):
+        log.warning("object %d (%s) is held by --pin, so that its --velocity has no effect", id, scene.name_of(id))
+    end = (options.steps - 1) * options.dt
+    if late := [f for f in prompts.forces if f.start >= end]:
+        name = scene.name_of(late[0].object_id)
+        log.warning("%d of %d forces begin after the end of the simulation at %g s, such as one on %s at %g s; "
+                    "give more --steps", len(late), len(prompts.forces), end, name, late[0].start)  # fmt: skip
 
 
 def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> SimulateOptions:

@@ -291,6 +291,16 @@ def test_objects_without_extent_are_left_out(balls, caplog):
     assert "object 1 (red ball) is too far from the origin for its size" in caplog.text
 
 
+def test_prompts_that_change_nothing_are_named(tmp_path, file, caplog):
+    prompts = {"pin": ("1",), "velocity": ("object=1 0,0,1",), "force": ("object=2 force=0,0,1 from=0.02",)}
+    run(file, tmp_path / "a.h5", SimulateOptions(engine="rigid", steps=2, **prompts))
+    assert "object 1 (red ball) is held by --pin, so that its --velocity has no effect" in caplog.text
+    assert "1 of 1 forces begin after the end of the simulation at 0.02 s" in caplog.text
+    caplog.clear()
+    run(file, tmp_path / "a.h5", SimulateOptions(engine="rigid", steps=3, force=prompts["force"]))
+    assert "forces begin" not in caplog.text
+
+
 def test_frames_of_thousands_of_steps_of_the_learned_field_are_refused(balls):
     g = balls.gaussians
     tiny = replace(balls, gaussians=replace(g, means=1e-6 * g.means, scales=1e-6 * g.scales))

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.physics.materials import find_object
+from stages.core.physics.materials import check_new, find_object
 from stages.core.scene.files import read_json_file
 from stages.core.scene.prompt_rows import FIELDS, read_prompts
 from stages.core.scene.scene import SceneObject
@@ -103,13 +103,14 @@ def parse(
 ) -> ForcePrompts:  # fmt: skip
     """Parse the prompts of the command line, and add them to `stored` ones; objects are given by id or name.
 
-    Raises InputError for malformed prompts and unknown objects.
+    Lifts of named objects count before that of all. Raises InputError for malformed prompts, unknown objects, and two
+    velocities or lifts of an object.
     """
     return ForcePrompts(
         (*(_force(text, objects) for text in force), *stored.forces),
         stored.pinned | {find_object(p, objects, f"--pin {quote(repr(p))}").id for p in pin},
-        stored.velocity | dict(_velocity(text, objects) for text in velocity),
-        stored.lift | {id: height for text in lift for id, height in _lift(text, objects)},
+        stored.velocity | _velocities(velocity, objects),
+        stored.lift | _lifts(lift, objects),
         stored.changes,
     )
 
@@ -140,20 +141,29 @@ def _checked(force: Force, where: str) -> Force:
     return force
 
 
-def _velocity(text: str, objects: Sequence[SceneObject]) -> tuple[int, Vector]:
-    where = f"--velocity {quote(repr(text))}"
-    words = text.split()
-    if len(words) != 2 or not words[0].startswith("object="):
-        raise InputError(f'{where}: write "object=1 0,0,2"')
-    return find_object(words[0].removeprefix("object="), objects, where).id, vector(words[1], where)
+def _velocities(texts: Sequence[str], objects: Sequence[SceneObject]) -> dict[int, Vector]:
+    given: dict[int, Vector] = {}
+    for text in texts:
+        where, words = f"--velocity {quote(repr(text))}", text.split()
+        if len(words) != 2 or not words[0].startswith("object="):
+            raise InputError(f'{where}: write "object=1 0,0,2"')
+        o = find_object(words[0].removeprefix("object="), objects, where)
+        check_new(o, given, where)
+        given[o.id] = vector(words[1], where)
+    return given
 
 
-def _lift(text: str, objects: Sequence[SceneObject]) -> list[tuple[int, float]]:
-    where = f"--lift {quote(repr(text))}"
-    key, equals, height = text.rpartition("=")
-    value = number(height, where)
-    chosen = [find_object(key, objects, where)] if equals else objects
-    return [(o.id, value) for o in chosen]
+def _lifts(texts: Sequence[str], objects: Sequence[SceneObject]) -> dict[int, float]:
+    of_all: dict[int, float] = {}
+    given: dict[int, float] = {}
+    for text in texts:
+        where = f"--lift {quote(repr(text))}"
+        key, equals, height = text.rpartition("=")
+        chosen, into = ([find_object(key, objects, where)], given) if equals else (objects, of_all)
+        for o in chosen:
+            check_new(o, into, where)
+        into.update({o.id: number(height, where) for o in chosen})
+    return of_all | given
 
 
 def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> list[Force]:

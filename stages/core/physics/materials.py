@@ -10,7 +10,7 @@ which half an oscillation leaves the measured share of the speed (restitution).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -169,12 +169,16 @@ def choose_materials(
             raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one material")
         several = isinstance(value, dict) and "parts" in value
         given[o.id] = _parts(value, where, Path(file).parent) if several else _material(value, where)
+    asked: dict[int, MaterialChoice] = {}
     for prompt in prompts:
         key, equals, value = prompt.partition("=")
         if not equals or not value.strip():
             raise InputError(f"--material {quote(repr(prompt))}: write OBJECT=MATERIAL, such as duck=rubber")
         where = f"--material {quote(repr(prompt))}"
-        given[find_object(key, objects, where).id] = _material(value.strip(), where)
+        o = find_object(key, objects, where)
+        check_new(o, asked, where)
+        asked[o.id] = _material(value.strip(), where)
+    given |= asked
     return {o.id: given.get(o.id) or _by_name(o) for o in objects}
 
 
@@ -191,6 +195,12 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
     have = quote(", ".join(f"{o.id} ({o.name})" for o in objects) or "none", 300)
     problem = f"fits {len(near)} objects" if near else "is not an object of this scene"
     raise InputError(f"{where}: {quote(repr(text))} {problem}; there are: {have}")
+
+
+def check_new(o: SceneObject, given: Collection[int], where: str) -> None:
+    """InputError if an option, which `where` begins with, was given for this object before."""
+    if o.id in given:
+        raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one")
 
 
 def _by_name(o: SceneObject) -> MaterialChoice:

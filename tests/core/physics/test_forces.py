@@ -40,6 +40,10 @@ def test_pin_velocity_and_lift():
     json.dumps(p.as_dicts())
 
 
+def test_lifts_of_named_objects_count_before_that_of_all():
+    assert parse(OBJECTS, lift=["2=0.5", "0.3"]).lift == {1: 0.3, 2: 0.5}
+
+
 def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     file = tmp_path / "forces.json"
     row = {"obj_id": 0, "start": 0.2, "end": 0.4, "force": [0, 0, 8]}
@@ -69,6 +73,9 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     ({"lift": ["high"]}, "'high' is not a number"),
     ({"lift": ["3=1"]}, "not an object"),
     ({"lift": ["nan"]}, "not finite"),
+    ({"lift": ["0.1", "0.2"]}, r"--lift '0.2': object 1 \(duck\) is there twice"),
+    ({"lift": ["1=0.1", "duck=0.2"]}, r"--lift 'duck=0.2': object 1 \(duck\) is there twice"),
+    ({"velocity": ["object=2 0,0,1", "object=phone 0,0,2"]}, r"object 2 \(phone\) is there twice"),
 ])  # fmt: skip
 def test_invalid_prompts(prompt, message):
     with pytest.raises(InputError, match=message):

@@ -71,6 +71,11 @@ def test_invalid_prompts(prompt, message):
         choose_materials(OBJECTS, [prompt])
 
 
+def test_an_object_has_one_material_of_the_command_line():
+    with pytest.raises(InputError, match=r"--material '1=steel': object 1 \(rubber duck\) is there twice"):
+        choose_materials(OBJECTS, ["duck=rubber", "1=steel"])
+
+
 @pytest.mark.parametrize("text, message", [
     ("{", "not JSON"), ("[]", "object name or id"), ('{"duck": 3}', "material's name"),
     ('{"duck": {"E": 1e5}}', "E, density"), ('{"duck": {"E": -1, "density": 1}}', "positive"),

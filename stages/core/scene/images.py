@@ -229,11 +229,11 @@ def video_info(path: Path) -> tuple[int, float]:
 
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
-    """The frames of a video in order, RGB in 0..1. Raises InputError for a damaged video."""
+    """The frames of a video in order, upright, RGB in 0..1. Raises InputError for a damaged video."""
     with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
-                yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
+                yield torch.from_numpy(_upright(frame, frame.to_ndarray(format="rgb24")).astype(np.float32) / 255)
         except import_av(path).FFmpegError as error:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
 
@@ -261,9 +261,17 @@ def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[i
     shrink = min(1.0, side / max(frame.width, frame.height))
     size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
     pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
-    turns = round(getattr(frame, "rotation", 0) / 90)
-    full = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
-    return torch.from_numpy(np.ascontiguousarray(np.rot90(pixels, turns))), full
+    full = (frame.height, frame.width) if _quarter_turns(frame) % 2 else (frame.width, frame.height)
+    return torch.from_numpy(_upright(frame, pixels)), full
+
+
+def _quarter_turns(frame: Any) -> int:
+    """Number of turns by 90 degrees, anticlockwise, after which a frame of PyAV is upright."""
+    return round(getattr(frame, "rotation", 0) / 90)
+
+
+def _upright(frame: Any, pixels: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.rot90(pixels, _quarter_turns(frame)))
 
 
 def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:

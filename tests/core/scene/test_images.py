@@ -82,6 +82,19 @@ def test_video_is_h264_with_leading_index(tmp_path):
     torch.testing.assert_close(torch.tensor([float(f.mean()) for f in frames]), torch.tensor(shades), atol=0.02, rtol=0)
 
 
+def test_frames_of_films_that_phones_turned_are_upright(tmp_path):
+    path = tmp_path / "v.mp4"
+    image = torch.zeros(32, 64, 3)
+    image[:, :16] = 1.0  # left
+    with VideoWriter(path, fps=50.0) as video:
+        video.append(image)
+    data, one = path.read_bytes(), 1 << 16
+    at = data.find(struct.pack(">4i", one, 0, 0, 0), data.find(b"tkhd"))  # matrix of the track, 9 numbers
+    path.write_bytes(data[:at] + struct.pack(">5i", 0, one, 0, -one, 0) + data[at + 20 :])  # by 90 degrees clockwise
+    frame = next(read_video(path))
+    assert frame.shape == (64, 32, 3) and float(frame[:12].mean()) > 0.9 and float(frame[20:].mean()) < 0.1
+
+
 @pytest.mark.parametrize("reader", [read_image, read_labels, lambda path: next(read_video(path))])
 def test_file_that_is_no_image_is_refused(tmp_path, reader):
     path = tmp_path / "x.png"

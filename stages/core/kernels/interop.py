@@ -1,21 +1,37 @@
 """Interoperability: Warp kernels on PyTorch tensors, devices and CUDA streams."""
 
+import logging
 import os
 from collections.abc import Mapping
 from functools import cache
+from tempfile import TemporaryDirectory
 
 import torch
 import warp as wp
 
 from stages.core.errors import MissingPackage
 
+log = logging.getLogger(__name__)
 wp.config.log_level = wp.LOG_ERROR
+_folders: list[TemporaryDirectory] = []  # deleted when the process ends
 
 
 @cache
 def _ready() -> None:
-    """Initialise Warp once. Its native code reports a missing CUDA driver on file descriptor 2, where Python cannot
-    filter it; without a GPU that descriptor is redirected during initialisation."""
+    """Initialise Warp once, with a temporary folder for kernels where that in the user's home cannot be created."""
+    try:
+        _initialise()
+    except OSError as error:
+        log.warning("%s: cannot be created (%s), so that each run compiles its kernels; set $WARP_CACHE_PATH to a "
+                    "folder that can be written to", error.filename, error.strerror)  # fmt: skip
+        _folders.append(TemporaryDirectory(prefix="ngff-kernels-"))
+        wp.config.kernel_cache_dir = _folders[-1].name
+        _initialise()
+
+
+def _initialise() -> None:
+    """Initialise Warp. Its native code reports a missing CUDA driver on file descriptor 2, where Python cannot filter
+    it; without a GPU that descriptor is redirected during initialisation."""
     if torch.cuda.is_available():
         wp.init()
         return

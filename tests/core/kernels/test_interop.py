@@ -1,5 +1,9 @@
 """Structs of tensors for kernels, and Warp without its compiler for the CPU."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 import warp as wp
@@ -66,3 +70,13 @@ def test_without_a_compiler_cpu_tensors_are_skinned_on_the_gpu(monkeypatch):
     monkeypatch.setattr(interop, "compiles_for_cpu", lambda: False)
     for ours, theirs in zip(skin_gaussians(*random_inputs("cpu")), expected, strict=True):
         assert ours.device.type == "cpu" and torch.equal(ours, theirs.cpu())
+
+
+def test_without_a_home_kernels_are_compiled_in_a_temporary_folder(tmp_path):
+    (tmp_path / "file").touch()
+    code = ("import warp as wp; from stages.core.kernels import interop; interop.compiles_for_cpu();"
+            "print(wp.config.kernel_cache_dir)")  # fmt: skip
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.startswith(str(tmp_path / "ngff-kernels-")) and "set $WARP_CACHE_PATH" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -98,6 +98,7 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may have it ignored
         signal.signal(signal.SIGINT, interrupt)
     gc.set_threshold(NEW_OBJECTS)
+    _replace_closed_streams()
     try:
         app(words)
     except KeyboardInterrupt:  # before the command has begun
@@ -105,9 +106,21 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
     except Exception as error:  # as well
         if _is_out_of_memory(error):
             fail(OUT_OF_MEMORY.format("the machine"), 1)
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # from --help
+            fail(f"standard output: {error.strerror}", 2)
         raise
     finally:
         gc.freeze()  # else Python searches the objects of all modules for garbage as it ends, for most of a second
+
+
+def _replace_closed_streams() -> None:
+    """Open the null device for each standard stream that the caller has closed, as `2>&-` does in a shell.
+
+    A file opened later would get its number, and whatever libraries report there would be written into that file.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # os.open takes the lowest free number
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def interrupt(number: int, frame) -> None:

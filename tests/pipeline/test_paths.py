@@ -52,3 +52,12 @@ def test_locale_without_umlauts(tmp_path):
         line = [sys.executable, "-m", "ngff_cli.app", *map(str, words)]
         done = subprocess.run(line, env=environment, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes streams by a shell")
+def test_streams_that_the_caller_closed(tmp_path):
+    scene, out = tmp_path / "s.ply", tmp_path / "o.png"
+    write_scene(scene, two_balls_scene())
+    line = f'exec "$0" -m ngff_cli.app render "{scene}" --resolution 32 -o "{out}" <&- >&- 2>&-'
+    done = subprocess.run(["sh", "-c", line, sys.executable], cwd=ROOT, check=False)
+    assert done.returncode == 0 and out.read_bytes().startswith(b"\x89PNG")

@@ -1,5 +1,6 @@
 """Solved contacts of the learned field against textbook physics, through the stage, and when they are taken."""
 
+import json
 import math
 
 import pytest
@@ -11,7 +12,7 @@ from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
-from stages.lab.bench.experiments.bodies import bowl, compound, tilted
+from stages.lab.bench.experiments.bodies import Run, ball, bowl, compound, tilted
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.experiments.friction import ladder_angle
 from stages.lab.bench.motion_options import PhysicsBenchOptions
@@ -25,11 +26,27 @@ SOLVED = PhysicsBenchOptions(contact="solved")
 
 
 @pytest.mark.parametrize(
-    "name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3", "slide/stool on shelf friction=0.6"]
-)
+    "name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3", "slide/stool on shelf friction=0.6",
+             "collision/row of five"]
+)  # fmt: skip
 def test_agrees_with_theory_where_learned_contact_does_not(device, name):
     experiment = experiments()[name]
     assert experiment.passes("ngff", measure(experiment, "ngff", SOLVED)["value"])
+
+
+def test_a_light_ball_between_heavy_ones_keeps_momentum_and_gains_no_energy(device, tmp_path):
+    """It rebounds from both by turns, more often than a substep allows."""
+    masses = torch.tensor([1.0, 1e-3, 1.0])
+    balls = [ball(0.1, (x, 0.0, 0.5), density=1000 * float(m)) for x, m in zip((-0.25, 0.0, 0.2), masses, strict=True)]
+    path = tmp_path / "m.json"
+    path.write_text(json.dumps({str(i + 1): b.material() for i, b in enumerate(balls)}))
+    options = SimulateOptions(engine="ngff", contact="solved", steps=16, keypoints=64, gravity=0.0, materials=path,
+                              velocity=("object=1 1,0,0",), device=device)  # fmt: skip
+    t = roll_out(Run(tuple(balls)).scene(), options)
+    velocity = (t.com[-1] - t.com[-2])[:, 0] / options.dt
+    assert float(masses @ velocity) == pytest.approx(1.0, abs=1e-3)
+    assert float(masses @ velocity**2) < 1.0
+    assert float(velocity[2]) > float(velocity[0])
 
 
 @pytest.mark.slow

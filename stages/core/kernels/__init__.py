@@ -34,8 +34,9 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | field/contact_solve,          | Warp with C++ and CUDA      | `tests/core/kernels/contact_reference.py`            |
 |   contact_impulses,           |   snippets                  |                                                      |
 |   newton_system               |                             |                                                      |
-| field/rigid_frames,           | Warp                        | slides, slopes, rebounds and towers                  |
-|   contact_patches, groups     |                             |                                                      |
+| field/rigid_frames,           | Warp                        | slides, slopes, rebounds, towers, rows of balls      |
+|   contact_turns, groups,      |                             |                                                      |
+|   contact_patches             |                             |                                                      |
 | field/nearest, perceptron     | Triton                      | `..._reference` in each file                         |
 | field/skinny_matmul           | Triton                      | `A @ x` in double precision                          |
 | field/neighbourhoods          | Triton                      | `models.field.rest_shape`                            |

@@ -61,10 +61,15 @@ class Contacts:
     arm_a: wp.array2d[wp.vec3d]  # from the centres of mass [m]
     arm_b: wp.array2d[wp.vec3d]
     target: wp.array2d[f64]  # least normal speed of a relative to b after the step [m/s]
+    resting: wp.array2d[f64]  # the same of a contact that does not rebound
+    least: wp.array2d[f64]  # normal speed below which it rebounds [m/s]
+    gained: wp.array2d[f64]  # normal speed that other forces give until the middle of the step [m/s]
+    restitution: wp.array2d[f64]
     friction: wp.array2d[f64]
     R_n: wp.array2d[f64]
     R_t: wp.array2d[f64]
     impulse: wp.array2d[wp.vec3d]  # on a [N s]; the result
+    total: wp.array2d[wp.vec3d]  # that of all turns of impacts
 
 
 @wp.struct
@@ -104,6 +109,7 @@ class ContactSolver:
     inertia: Inertias
     velocities: Velocities  # near the solution at first, then those after the step; 0 of pinned bodies
     free: Velocities  # those without contact; 0 of pinned bodies
+    impacted: Velocities  # those at the start of the step, changed by impacts; 0 of pinned bodies
     memory: SolverMemory
 
 
@@ -124,8 +130,8 @@ def contact_solver(device: str, scenes: int, bodies: int, contacts: int, group: 
         order=(b, bodies), rank=(b, bodies), first_rank=(b, bodies), last_rank=(b, bodies), partial=(b, group),
     )  # fmt: skip
     memory.decomposition = empty_arrays(Decomposition, device, (b, n), H=(b, n * (n + 1)))
-    memory.step, memory.before, out.velocities, out.free = (
-        empty_arrays(Velocities, device, (b, bodies)) for _ in range(4)
+    memory.step, memory.before, out.velocities, out.free, out.impacted = (
+        empty_arrays(Velocities, device, (b, bodies)) for _ in range(5)
     )  # fmt: skip
     out.memory = memory
     return out

@@ -55,7 +55,7 @@ def _over_group(combine: Callable) -> wp.Function:
     return over_group
 
 
-_total, _largest = _over_group(wp.add), _over_group(wp.max)
+_total, largest = _over_group(wp.add), _over_group(wp.max)
 
 
 @wp.func
@@ -137,7 +137,7 @@ def _newton_step(s: ContactSolver, thread: GroupThread) -> f64:
         s.velocities.angular[scene, i] = s.velocities.angular[scene, i] + angular
         for k in range(3):
             change = wp.max(change, wp.max(wp.abs(linear[k]), wp.abs(angular[k])))
-    return _largest(s.memory, thread, bodies, change)
+    return largest(s.memory, thread, bodies, change)
 
 
 @wp.func
@@ -169,7 +169,7 @@ def solve(s: ContactSolver, thread: GroupThread):
             angular = s.velocities.angular[scene, i] - s.memory.before.angular[scene, i]
             for axis in range(3):
                 change = wp.max(change, wp.max(wp.abs(linear[axis]), wp.abs(angular[axis])))
-        if _largest(s.memory, thread, bodies, change) < TOLERANCE and k > 0:
+        if largest(s.memory, thread, bodies, change) < TOLERANCE and k > 0:
             break
     for i in range(thread.lane, count, thread.lanes):
         relative = relative_velocity(s.contacts, s.velocities, scene, i)

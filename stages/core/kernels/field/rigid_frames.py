@@ -24,7 +24,7 @@ from stages.core.kernels.field.contact_impulses import (
 )
 from stages.core.kernels.field.contact_patches import Patches, add_load, single, spread, sum_patch
 from stages.core.kernels.field.contact_search import NONE, SLOTS, CollisionWorld, Found, contact_in_slot, search
-from stages.core.kernels.field.contact_solve import solve
+from stages.core.kernels.field.contact_turns import solve_in_turns
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.field.near_points import MARGIN, BodyMotion, NearPoint
 from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
@@ -90,7 +90,11 @@ def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver,
     solver.velocities.angular[scene, i] = _double(spin)
     solver.free.linear[scene, i] = wp.vec3d()
     solver.free.angular[scene, i] = wp.vec3d()
+    solver.impacted.linear[scene, i] = wp.vec3d()
+    solver.impacted.angular[scene, i] = wp.vec3d()
     if not world.motion.pinned[scene, i]:
+        solver.impacted.linear[scene, i] = _double(velocity)
+        solver.impacted.angular[scene, i] = _double(spin)
         solver.free.linear[scene, i] = _double(velocity + h * bodies.acceleration[scene, i])
         solver.free.angular[scene, i] = _double(later)
 
@@ -106,30 +110,27 @@ def _add_contact(bodies: BodyProperties, m: BodyMotion, solver: ContactSolver, n
         at = near.at - near.gap / 2.0 * near.normal
     arm_a = at - m.com[scene, a]
     arm_b = at - m.com[scene, b]
-    speed = m.velocity[scene, a] + wp.cross(m.spin[scene, a], arm_a)
     pull = bodies.acceleration[scene, a]
     loss = bodies.loss[scene, a]
     friction = bodies.friction[scene, a]
     response = effective_response(solver.inertia, scene, a, _double(arm_a))
     if b != a:
-        speed -= m.velocity[scene, b] + wp.cross(m.spin[scene, b], arm_b)
         pull -= bodies.acceleration[scene, b]
         loss = wp.max(loss, bodies.loss[scene, b])
         friction = wp.max(friction, bodies.friction[scene, b])
         response += effective_response(solver.inertia, scene, b, _double(arm_b))
-    approach = wp.dot(speed, near.normal)
-    gained = h / 2.0 * wp.dot(pull, near.normal)  # until the middle of the step, and again after it
-    target = -near.gap / h
+    resting = -near.gap / h
     if near.gap <= 0.0:
-        target = wp.min(-RECOVERY / h * near.gap, MAX_RECOVERY_SPEED)
-    if approach < -REBOUND_SPEED and near.gap + h * approach < ROUGHNESS:
-        target = wp.max(target, gained - wp.exp(-HALF_PI * loss) * (approach + gained))
+        resting = wp.min(-RECOVERY / h * near.gap, MAX_RECOVERY_SPEED)
     solver.contacts.a[scene, i] = a
     solver.contacts.b[scene, i] = b
     solver.contacts.normal[scene, i] = _double(near.normal)
     solver.contacts.arm_a[scene, i] = _double(arm_a)
     solver.contacts.arm_b[scene, i] = _double(arm_b)
-    solver.contacts.target[scene, i] = f64(target)
+    solver.contacts.resting[scene, i] = f64(resting)
+    solver.contacts.least[scene, i] = f64(wp.min(-REBOUND_SPEED, (ROUGHNESS - near.gap) / h))
+    solver.contacts.gained[scene, i] = f64(h / 2.0 * wp.dot(pull, near.normal))
+    solver.contacts.restitution[scene, i] = f64(wp.exp(-HALF_PI * loss))
     solver.contacts.friction[scene, i] = f64(friction)
     solver.contacts.R_n[scene, i] = NORMAL_REGULARISATION * response
     solver.contacts.R_t[scene, i] = FRICTION_REGULARISATION * response
@@ -192,7 +193,7 @@ def _frames(
                     i += 1
         wait_for_group()
         if solver.contacts.active_count[scene] > 0:
-            solve(solver, thread)
+            solve_in_turns(solver, thread)
             for k in range(thread.lane, solver.contacts.active_count[scene], lanes):
                 sum_patch(world, solver.contacts, patches, scene, solver.contacts.active[scene, k])
             wait_for_group()

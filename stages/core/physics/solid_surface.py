@@ -196,7 +196,8 @@ class SolidSurface:
         return self._fine_grid, self._first
 
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
-        return self._at(self._depth, x)
+        inside = x.clip(self._first, self._first + self.h * (np.array(self._full.shape) - 1))
+        return self._at(self._depth, inside) - np.linalg.norm(x - inside, axis=1)
 
     def _at(self, grid: np.ndarray, x: np.ndarray) -> np.ndarray:
         return ndimage.map_coordinates(grid, ((x - self._first) / self.h).T, order=1, mode="nearest")

@@ -68,6 +68,20 @@ def test_bodies_that_overlap_share_their_voxels():
     assert float(bodies.volume[bodies.body == 1].sum()) == pytest.approx(4 / 3 * math.pi * 0.12**3, rel=0.1)
 
 
+def test_a_small_body_beside_a_large_one_has_no_particles_outside():
+    """Where a particle's voxel is larger than the grid of the body's signed distances goes beyond it."""
+    surfaces = [box((0.6,) * 3, 0.02).moved((0.0, 0.0, 0.3)), box((0.15,) * 3, 0.006).moved((0.6, 0.0, 0.075))]
+    parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1, widest=math.inf)
+             for i, s in enumerate(surfaces)]  # fmt: skip
+    scene = Scene(concatenate(parts), (SceneObject(1, "large"), SceneObject(2, "small")), None, 0.0)
+    bodies = surface_particles(scene, sample_bodies(scene, 3000, skin=True))
+    small, h = bodies.body == 1, bodies.spacing
+    assert h > 0.15 / 5
+    corner = torch.floor(bodies.x[small] / h) * h - torch.tensor([0.525, -0.075, 0.0])
+    assert float((corner + h).min()) > 0 and float(corner.max()) < 0.15
+    assert float(bodies.volume[small].sum()) == pytest.approx(0.15**3, rel=0.1)
+
+
 def test_a_sheet_stays_thick_enough_to_hold_together():
     rng = np.random.default_rng(0)
     sheet = ball((0, 0, 0), 1.0, 4000, (1, 0, 0), 1)

@@ -75,10 +75,12 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
         lift[row, 2] = prompts.lift.get(o.id, 0.0)
-    # a voxel ends half a spacing below its particle, less where only its upper part is filled; without the
-    # outermost layer the visible body ends one spacing further down
+    # a body ends at the faces of voxels, or where their upper parts are filled; without the outermost layer the visible
+    # body ends a spacing and a half below its particles
     below = 0.5 if refinement else 1.5
-    ends = bodies.x[:, 2] - ((bodies.volume / h**3 - 0.5) * h if refinement else below * h)
+    ends = bodies.x[:, 2] - below * h
+    if refinement:  # particles are beside the middles of their voxels
+        ends = ((bodies.x[:, 2] / h).floor() + 1) * h - bodies.volume / h**2
     bottom = torch.stack([ends[bodies.body == row].quantile(0.01) for row in range(count)])
     start = bottom + lift[:, 2]
     asked = parse_box(options.box) if options.box else None

@@ -4,7 +4,8 @@ penetration: depth of the deepest keypoint of an object in another object or bel
 height of the two. With an engine whose table has edges: in the table, from its top or its sides. The depth in the
 scene at rest is subtracted, and so is one that --lift causes, which has a warning of its own. The distance of a
 keypoint from the mean surface of its own object (noise, floaters) is subtracted too, and in other objects its depth
-below the floor at rest, where bodies are cut off.
+below the floor at rest, where bodies are cut off. In a deformed object it is measured where the material was at rest,
+since a dent under a load is no penetration.
 creep: speed of an object in the last quarter of the time, if it is slow in all of that quarter [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest increase of the mechanical energy of all objects above that at the start, or after the last force,
@@ -20,6 +21,7 @@ from collections import deque
 from functools import cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.forces import ForcePrompts
@@ -35,7 +37,8 @@ log = logging.getLogger(__name__)
 BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a warning is logged
 MAX_CHECKED_KEYPOINTS = 256  # keypoints of an object whose depth is measured
 SLOW = 0.1  # largest speed of an object that creeps, relative to that of a fall by half the object's size
-MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured [size]
+MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured, or least deformation [size]
+NEIGHBOURS = 4  # keypoints whose displacement a point in a deformed object has
 
 
 class PlausibilityMonitor:
@@ -99,6 +102,7 @@ class PlausibilityMonitor:
         for a, b in zip(*np.nonzero(near), strict=True):
             if a != b:
                 local = (points[a][self._few[a]] - com[b]) @ R[b] + self._origin[b]
+                local = self._undeformed(b, local, (points[b] - com[b]) @ R[b] + self._origin[b])
                 depth = float(self._depth(a, b, local).max())
                 if self._frames == 1:  # where the prompts put it
                     self._put_into[a, b] = depth
@@ -107,6 +111,16 @@ class PlausibilityMonitor:
                 for i, other in ((a, b), (b, a)):
                     o = self._scene.objects[other]
                     self._record(i, depth, smaller, f"object {o.id} ({o.name})")
+
+    def _undeformed(self, row: int, x: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+        """Where points (k, 3) near an object's `keypoints` would be at rest if they moved with the nearest of these."""
+        shift = self._rest[row] - keypoints
+        if np.abs(shift).max() < MOVED * self._size[row]:
+            return x
+        distance, near = cKDTree(keypoints).query(x, min(NEIGHBOURS, len(keypoints)))
+        weight = 1 / np.maximum(distance.reshape(len(x), -1), 1e-9 * self._size[row]) ** 2
+        weight /= weight.sum(1, keepdims=True)
+        return x + (weight[..., None] * shift[near.reshape(len(x), -1)]).sum(1)
 
     def _record(self, row: int, depth: float, height: float, partner: str) -> None:
         if depth / height > self.penetration[row]:

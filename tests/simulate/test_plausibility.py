@@ -67,6 +67,24 @@ def test_depth_of_penetration(scene, caplog):
     assert below["objects"]["2"]["penetration"] == pytest.approx(0.25, abs=0.01)
 
 
+def test_a_dent_under_a_load_is_no_penetration(scene):
+    """The lower cube is compressed by a fifth, and the upper one comes down with its upper face; then .01 further."""
+    keypoints = choose_keypoints(scene, 256)
+    upper = keypoints.object_id == 2
+    com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])
+    for more, depth in ((0.0, 0.0), (0.01, 0.05)):
+        monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), SimulateOptions())
+        for share in torch.linspace(0.0, 1.0, 10).tolist():
+            x, moved = keypoints.rest.clone(), com.clone()
+            x[~upper, 2] *= 1 - 0.2 * share
+            moved[0, 2] *= 1 - 0.2 * share
+            x[upper, 2] -= (0.04 + more) * share
+            moved[1, 2] -= (0.04 + more) * share
+            monitor.add(FrameState(x, moved, torch.tensor([[1.0, 0, 0, 0]] * 2)))
+        found = monitor.result()["objects"]
+        assert found["2"]["penetration"] == pytest.approx(depth, abs=0.02)
+
+
 def test_depth_in_the_height_of_a_flat_sheet_is_relative_to_a_voxel_of_it(scene):
     """The lower cube, and a sheet on it that sinks in by .01."""
     upper = scene.gaussians.object_id == 2

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.materials import MODELS, Material, MaterialChoice, choose_materials
-from stages.core.scene.scene import Scene, SceneObject
+from stages.core.physics.materials import MODELS, Material, choose_materials
+from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import AUTO, SimulateOptions
+from stages.simulate.setup import held_as_seen
 
 log = logging.getLogger(__name__)
-MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
+MAX_RIGID_SAG = 0.02  # largest compression by its own weight and what is above it of a body that counts as rigid
 MAX_SOLVED_SAG = 0.027  # the same of a body with solved contacts, whose dents then leave gaps of 5 % of its height
-MAX_RIGID_IMPACT = 0.1  # largest compression by its own impact; that of which `plausibility.py` warns
+MAX_RIGID_DROOP = 0.1  # largest `droop` of a body that counts as rigid
+MAX_RIGID_IMPACT = 0.1  # largest compression by an impact; that of which `plausibility.py` warns
 NO_PROMPTS = ForcePrompts()
 
 
@@ -25,14 +32,15 @@ def with_engine(
 ) -> SimulateOptions:
     """The options with an engine and contacts in place of `auto`.
 
-    MPM if an object yields or flows, or has parts of different materials. Rigid bodies if no weight compresses an
-    object by more than MAX_RIGID_SAG, nor the speed that the prompts give it by more than MAX_RIGID_IMPACT. Of the two
-    engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
-    learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
-    Options of learned engines (weights, an integrator, its contacts) select it. Its contacts are learned if weight
-    compresses an object by more than MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since
-    solved ones have no rate of change, or with weights, which may be of a model without these contacts; else they are
-    solved.
+    MPM if an object yields or flows, has parts of different materials, or is soft: compressed by more than
+    MAX_RIGID_SAG by its own weight and what is above it, or by more than MAX_RIGID_IMPACT by the speed that the prompts
+    give it or what falls on it, or a sheet or rod off the floor that bends by more than MAX_RIGID_DROOP. Else rigid
+    bodies. Soft objects go to the learned field instead where MPM cannot follow, in live sessions and with objects of
+    photos that are held, unless the prompts move an object sideways or only an impact deforms it, since its learned
+    contacts have next to no friction and rebound. Options of learned engines (weights, an integrator, its contacts)
+    select it. Its contacts are learned if weight compresses an object by more than MAX_SOLVED_SAG and the prompts move
+    none sideways, with an integrator, since solved ones have no rate of change, or with weights, which may be of a
+    model without these contacts; else they are solved.
     """
     engine = options.engine
     if engine == AUTO:
@@ -42,8 +50,8 @@ def with_engine(
         return options
     if options.weights is not None or options.integrator != "step":
         return replace(options, contact="learned")
-    materials = choose_materials(scene.objects, options.material, options.materials)
-    soft = [] if _sideways(prompts) else _soft(materials, scene, keypoints, options.gravity, MAX_SOLVED_SAG)
+    blocks = [] if _sideways(prompts) else _blocks(options, scene, keypoints, prompts)
+    soft = [block for block in blocks if sag(block.material, block.sides[2], options.gravity) > MAX_SOLVED_SAG]
     if soft:
         log.info("--contact learned, as object %d is compressed by more than %.1f %% by its own weight",
                  soft[0].id, 100 * MAX_SOLVED_SAG)  # fmt: skip
@@ -57,32 +65,106 @@ def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
     materials = choose_materials(scene.objects, options.material, options.materials)
     uneven = [o for o in scene.objects if materials[o.id].several]
     plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
-    soft = _soft(materials, scene, keypoints, options.gravity, MAX_RIGID_SAG)
-    crushed = [o for o in scene.objects if impact(materials[o.id].material, _speed(scene, o.id, prompts, options))
-               > MAX_RIGID_IMPACT]  # fmt: skip
-    sideways = _sideways(prompts) if soft or crushed else []
+    blocks, held = _blocks(options, scene, keypoints, prompts), held_as_seen(scene, options)
+    # what photos show has been deformed by what is at rest on it
+    falling = [block for block in blocks if block.speed or not held]
+    floor = _floor(options, scene, blocks)
+    reasons = [reason for block in blocks if (reason := _deformed(block, falling, floor, options.gravity))]
+    lasting, sideways = [reason for reason in reasons if not reason.impact], _sideways(prompts)
     if plastic:
         engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
     elif uneven:
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
-    elif sideways:
-        engine, reason = "mpm", f"object {(soft or crushed)[0].id} is soft, and friction acts on object {sideways[0]}"
-    elif soft:
-        engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
-    elif crushed:
-        engine, reason = "mpm", f"an impact compresses object {crushed[0].id} by more than {MAX_RIGID_IMPACT:.0%}"
+    elif lasting and not sideways and (options.live or held):
+        unlike = "is slower than live sessions" if options.live else "does not hold objects of photos at rest"
+        engine, reason = "ngff", f"{lasting[0].text}, and --engine mpm {unlike}"
+    elif reasons:
+        engine, reason = "mpm", (lasting or reasons)[0].text
     else:
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)
     return engine
 
 
-def _soft(
-    materials: Mapping[int, MaterialChoice], scene: Scene, keypoints: Keypoints, gravity: float, limit: float
-) -> list[SceneObject]:
-    """The objects that their own weight compresses by more than `limit`."""
-    return [o for o in scene.objects
-            if sag(materials[o.id].material, _height(scene, keypoints, o.id), gravity) > limit]  # fmt: skip
+class _Block(NamedTuple):
+    """An object as an upright box, once it is lifted, in metres and kilograms."""
+
+    id: int
+    material: Material
+    guessed: bool  # whether the material is not known
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+    extents: Float[np.ndarray, "3"]  # along its own principal axes, ascending
+    mass: float
+    speed: float  # at the start and after the fall of its lift [m/s]
+
+    @property
+    def sides(self) -> Float[np.ndarray, "3"]:
+        return self.high - self.low
+
+    @property
+    def base(self) -> float:
+        """Area of its base [m^2]."""
+        return float(max(self.sides[0] * self.sides[1], 1e-12))
+
+    def is_above(self, other: _Block) -> bool:
+        """Whether it is above the middle of another one, so that it may fall or rest on it."""
+        beside = (self.low[:2] >= other.high[:2]).any() or (self.high[:2] <= other.low[:2]).any()
+        return not beside and bool(self.low[2] >= (other.low[2] + other.high[2]) / 2)
+
+
+def _blocks(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts) -> list[_Block]:
+    """The objects that have keypoints; masses are those of the hulls of these."""
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    unit, blocks = scene.metres_per_unit, []
+    for o in scene.objects:
+        x = unit * keypoints.rest[keypoints.object_id == o.id].double().numpy()
+        if not len(x):
+            continue
+        _, axes = np.linalg.eigh(np.cov(x.T, bias=True))
+        try:
+            volume = float(ConvexHull(x).volume)
+        except (QhullError, ValueError):  # of what is flat
+            volume = 0.0
+        lift = np.array([0.0, 0.0, unit * prompts.lift.get(o.id, 0.0)])
+        choice = materials[o.id]
+        blocks.append(_Block(o.id, choice.material, choice.guessed, x.min(0) + lift, x.max(0) + lift,
+                             np.ptp(x @ axes, axis=0), choice.material.density * volume,
+                             _speed(scene, o.id, prompts, options)))  # fmt: skip
+    return blocks
+
+
+def _floor(options: SimulateOptions, scene: Scene, blocks: Sequence[_Block]) -> float:
+    """Height of the floor [m]; that of the lowest object if the scene has none."""
+    floor = options.floor if options.floor is not None else scene.floor
+    lowest = min((float(block.low[2]) for block in blocks), default=0.0)
+    return lowest if floor is None else scene.metres_per_unit * floor
+
+
+class _Reason(NamedTuple):
+    """Why an object counts as soft."""
+
+    text: str
+    impact: bool  # it is not deformed for long
+
+
+def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: float) -> _Reason | None:
+    """What deforms an object so far that it does not count as rigid; `others` may press on it."""
+    m, height, g = block.material, float(block.sides[2]), abs(gravity)
+    above = [other for other in others if other is not block and other.is_above(block)]
+    load = g * sum(other.mass / min(other.base, block.base) for other in above)  # [Pa]
+    hits = (v * math.sqrt(other.mass / (m.E * min(other.base, block.base) * max(height, 1e-12)))
+            for other in above if (v := other.speed))  # fmt: skip
+    if sag(m, height, g) > MAX_RIGID_SAG:
+        return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight", False)
+    if load / m.E + sag(m, height, g) > MAX_RIGID_SAG:
+        return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by what is above it", False)
+    off_floor = block.low[2] - floor > block.extents[0]
+    if off_floor and not block.guessed and droop(m, block.extents, g) > MAX_RIGID_DROOP:
+        return _Reason(f"object {block.id} is so thin that it bends under its own weight", False)
+    if max(impact(m, block.speed), *hits, 0.0) > MAX_RIGID_IMPACT:
+        return _Reason(f"an impact compresses object {block.id} by more than {MAX_RIGID_IMPACT:.0%}", True)
+    return None
 
 
 def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) -> ForcePrompts:
@@ -106,6 +188,14 @@ def sag(material: Material, height: float, gravity: float) -> float:
     return material.density * abs(gravity) * height / material.E
 
 
+def droop(material: Material, extents: Sequence[float], gravity: float) -> float:
+    """How far the end of a sheet or rod hangs down that lies over an edge with half of its length, relative to that.
+
+    `extents` [m] ascending, of which the first is the thickness; by the theory of thin beams, gravity in m/s^2.
+    """
+    return 1.5 * material.density * abs(gravity) * (extents[2] / 2) ** 3 / (material.E * max(extents[0], 1e-12) ** 2)
+
+
 def impact(material: Material, speed: float) -> float:
     """Compression of a body that hits a rigid one at some speed [m/s], about: that behind the elastic wave in a rod."""
     return speed * math.sqrt(material.density / material.E)
@@ -123,8 +213,3 @@ def _sideways(prompts: ForcePrompts) -> list[int]:
     """Ids of the objects that the prompts throw or push horizontally."""
     pushes = [*prompts.velocity.items(), *((f.object_id, f.force) for f in prompts.forces)]
     return [id for id, v in pushes if any(v[:2])]
-
-
-def _height(scene: Scene, keypoints: Keypoints, object_id: int) -> float:
-    z = keypoints.rest[keypoints.object_id == object_id, 2]
-    return float(z.max() - z.min()) * scene.metres_per_unit

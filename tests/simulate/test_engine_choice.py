@@ -2,15 +2,20 @@
 
 import json
 import logging
+import math
 from dataclasses import replace
 
 import pytest
+import torch
 
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.physics.materials import Material
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.shapes import Surface, box, to_gaussians
 from stages.simulate import engine_choice
-from stages.simulate.engine_choice import for_engine, impact, sag, with_engine
+from stages.simulate.engine_choice import droop, for_engine, impact, sag, with_engine
 from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene
 
@@ -21,7 +26,7 @@ def chosen(**options):
 
 
 @pytest.mark.parametrize(("options", "engine"), [
-    ({}, "rigid"), ({"material": ("1=pillow",)}, "ngff"), ({"material": ("1=pillow", "2=sand")}, "mpm"),
+    ({}, "rigid"), ({"material": ("1=pillow",)}, "mpm"), ({"material": ("1=pillow", "2=sand")}, "mpm"),
     ({"material": ("1=pillow",), "gravity": 0.0}, "rigid"), ({"integrator": "rk4"}, "ngff"),
     ({"engine": "mpm", "material": ("1=steel",)}, "mpm"),
 ])  # fmt: skip
@@ -32,7 +37,7 @@ def test_the_softest_object_decides(options, engine):
 def test_what_is_a_hundred_times_larger_is_softer():
     scene = two_balls_scene()
     large = replace(scene, scale={"metres_per_unit": 100.0})
-    assert with_engine(SimulateOptions(), large, choose_keypoints(large, 32)).engine == "ngff"
+    assert with_engine(SimulateOptions(), large, choose_keypoints(large, 32)).engine == "mpm"
 
 
 @pytest.mark.parametrize(("speed", "lift", "engine"), [(-1.0, 0.0, "rigid"), (-4.0, 0.0, "mpm"), (0.0, 0.7, "mpm")])
@@ -51,11 +56,52 @@ def test_what_an_impact_compresses_is_soft(speed, lift, engine):
     ("pillow", ForcePrompts((Force(2, force=(0.0, 0.0, 5.0)),), lift={1: 0.1}), "ngff"),
     ("wood", ForcePrompts(velocity={2: (0.0, 0.5, 0.0)}), "rigid"),
 ])  # fmt: skip
-def test_soft_bodies_slide_by_the_engine_that_has_friction(material, prompts, engine):
-    """A slide of any object, beside a soft one; the learned field stops all of them after the same distance."""
+@pytest.mark.parametrize("why", ["photos", "live"])
+def test_soft_bodies_slide_by_the_engine_that_has_friction(why, material, prompts, engine):
+    """A slide of any object, beside a soft one; the learned field, which these scenes are for, stops all of them after
+    the same distance."""
     scene = two_balls_scene()
-    options = SimulateOptions(material=(f"1={material}",))
+    scene = replace(scene, provenance={"command": "reconstruct"}) if why == "photos" else scene
+    options = SimulateOptions(material=(f"1={material}",), live=why == "live")
     assert with_engine(options, scene, choose_keypoints(scene, 32), prompts).engine == engine
+
+
+def block(sides: tuple, bottom: float) -> Surface:
+    return box(sides, max(sides) / 20).moved((0.0, 0.0, bottom + sides[2] / 2))
+
+
+def of_two(lower: Surface, upper: Surface) -> Scene:
+    parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1, widest=math.inf)
+             for i, s in enumerate((lower, upper))]  # fmt: skip
+    return Scene(concatenate(parts), (SceneObject(1, "lower"), SceneObject(2, "upper")), None, 0.0)
+
+
+@pytest.mark.parametrize(("density", "lift", "engine"), [(20, 0.0, "rigid"), (800, 0.0, "mpm"), (100, 0.5, "mpm")])
+def test_what_is_above_a_soft_body_compresses_it(tmp_path, density, lift, engine):
+    """A cube of foam of 1e4 Pa under one of half its side: .015 by its own weight, and density g .15 / E = .003 or
+    .118 by that of the other. One of 100 kg/m^3 that falls .5 m has the speed 3.1 m/s: 3.1 sqrt(100 / 2 / E) = .22.
+    """
+    scene = of_two(block((0.3,) * 3, 0.0), block((0.15,) * 3, 0.3))
+    (tmp_path / "m.json").write_text(json.dumps({"1": {"E": 1e4, "density": 50}, "2": {"E": 1e9, "density": density}}))
+    options = SimulateOptions(materials=tmp_path / "m.json")
+    keypoints, prompts = choose_keypoints(scene, 256), ForcePrompts(lift={2: lift})
+    assert with_engine(options, scene, keypoints, prompts).engine == engine
+    beside = replace(keypoints, rest=keypoints.rest + (keypoints.object_id == 2)[:, None] * torch.tensor([0.3, 0, 0]))
+    assert with_engine(options, scene, beside, prompts).engine == "rigid"
+
+
+@pytest.mark.parametrize(("bottom", "engine"), [(0.25, "mpm"), (0.0, "rigid")])
+def test_a_cloth_that_is_off_the_floor_bends(bottom, engine):
+    scene = of_two(block((0.2,) * 3, 0.0), block((0.5, 0.5, 0.02), bottom))
+    keypoints = choose_keypoints(scene, 256)
+    assert with_engine(SimulateOptions(material=("2=cloth",)), scene, keypoints).engine == engine
+    assert with_engine(SimulateOptions(material=("2=wood",)), scene, keypoints).engine == "rigid"
+
+
+def test_droop_of_a_cantilever():
+    """w L^4 / (8 E I) with w = rho g b t and I = b t^3 / 12, over L."""
+    assert droop(Material(E=1e6, density=1000.0), [0.01, 0.1, 0.4], 10.0) == pytest.approx(
+        1000 * 10 * 0.1 * 0.01 * 0.2**4 / (8 * 1e6 * 0.1 * 0.01**3 / 12) / 0.2)  # fmt: skip
 
 
 def test_sag_of_a_column():

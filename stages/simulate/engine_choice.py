@@ -33,14 +33,14 @@ def with_engine(
     """The options with an engine and contacts in place of `auto`.
 
     MPM if an object yields or flows, has parts of different materials, or is soft: compressed by more than
-    MAX_RIGID_SAG by its own weight and what is above it, or by more than MAX_RIGID_IMPACT by the speed that the prompts
-    give it or what falls on it, or a sheet or rod off the floor that bends by more than MAX_RIGID_DROOP. Else rigid
-    bodies. Soft objects go to the learned field instead where MPM cannot follow, in live sessions and with objects of
-    photos that are held, unless the prompts move an object sideways or only an impact deforms it, since its learned
-    contacts have next to no friction and rebound. Options of learned engines (weights, an integrator, its contacts)
-    select it. Its contacts are learned if weight compresses an object by more than MAX_SOLVED_SAG and the prompts move
-    none sideways, with an integrator, since solved ones have no rate of change, or with weights, which may be of a
-    model without these contacts; else they are solved.
+    MAX_RIGID_SAG by its own weight and what is above it or by a force of the prompts, or by more than MAX_RIGID_IMPACT
+    by the speed that the prompts give it or what falls on it, or a sheet or rod off the floor that bends by more than
+    MAX_RIGID_DROOP. Else rigid bodies. Soft objects go to the learned field instead where MPM cannot follow, in live
+    sessions and with objects of photos that are held, unless the prompts move an object sideways or only an impact
+    deforms it, since its learned contacts have next to no friction and rebound. Options of learned engines (weights, an
+    integrator, its contacts) select it. Its contacts are learned if weight compresses an object by more than
+    MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since solved ones have no rate of change, or
+    with weights, which may be of a model without these contacts; else they are solved.
     """
     engine = options.engine
     if engine == AUTO:
@@ -97,6 +97,7 @@ class _Block(NamedTuple):
     extents: Float[np.ndarray, "3"]  # along its own principal axes, ascending
     mass: float
     speed: float  # at the start and after the fall of its lift [m/s]
+    force: float  # of the prompts, the largest [N]
 
     @property
     def sides(self) -> Float[np.ndarray, "3"]:
@@ -128,9 +129,10 @@ def _blocks(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
             volume = 0.0
         lift = np.array([0.0, 0.0, unit * prompts.lift.get(o.id, 0.0)])
         choice = materials[o.id]
+        force = max((math.hypot(*f.force) for f in prompts.forces if f.object_id == o.id), default=0.0)
         blocks.append(_Block(o.id, choice.material, choice.guessed, x.min(0) + lift, x.max(0) + lift,
                              np.ptp(x @ axes, axis=0), choice.material.density * volume,
-                             _speed(scene, o.id, prompts, options)))  # fmt: skip
+                             _speed(scene, o.id, prompts, options), force))  # fmt: skip
     return blocks
 
 
@@ -159,6 +161,9 @@ def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: fl
         return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight", False)
     if load / m.E + sag(m, height, g) > MAX_RIGID_SAG:
         return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by what is above it", False)
+    least_face = max(float(np.prod(np.sort(block.sides)[:2])), 1e-12)
+    if block.force / (m.E * least_face) > MAX_RIGID_SAG:
+        return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by a force on it", False)
     off_floor = block.low[2] - floor > block.extents[0]
     if off_floor and not block.guessed and droop(m, block.extents, g) > MAX_RIGID_DROOP:
         return _Reason(f"object {block.id} is so thin that it bends under its own weight", False)

@@ -90,6 +90,16 @@ def test_what_is_above_a_soft_body_compresses_it(tmp_path, density, lift, engine
     assert with_engine(options, scene, beside, prompts).engine == "rigid"
 
 
+@pytest.mark.parametrize(("force", "engine"), [(0.9, "rigid"), (1.1, "mpm")])
+def test_a_force_compresses_a_soft_body(tmp_path, force, engine):
+    """On a face of .1 x .1 m of 1e4 Pa: 1 N compresses by .01, 2 N by .02."""
+    scene = of_two(block((0.1,) * 3, 0.0), block((0.1,) * 3, 0.3))
+    (tmp_path / "m.json").write_text(json.dumps({"1": {"E": 1e4, "density": 20}, "2": {"E": 1e9, "density": 1}}))
+    options = SimulateOptions(materials=tmp_path / "m.json")
+    prompts = ForcePrompts((Force(1, force=(0.0, 2 * force, 0.0)), Force(2, force=(0.0, 9.0, 0.0))))
+    assert with_engine(options, scene, choose_keypoints(scene, 256), prompts).engine == engine
+
+
 @pytest.mark.parametrize(("bottom", "engine"), [(0.25, "mpm"), (0.0, "rigid")])
 def test_a_cloth_that_is_off_the_floor_bends(bottom, engine):
     scene = of_two(block((0.2,) * 3, 0.0), block((0.5, 0.5, 0.02), bottom))

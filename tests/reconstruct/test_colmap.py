@@ -5,12 +5,12 @@ import threading
 import pytest
 
 from stages.core.errors import InputError
-from stages.reconstruct import colmap
+from stages.reconstruct import colmap, colmap_worker
 from stages.reconstruct.colmap import colmap_process, run_colmap
 from stages.reconstruct.features import writing_database
 from tests.limits import file_size_limit
 
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 
 
 @pytest.mark.parametrize(("code", "ending"), [("os.abort()", "signal SIGABRT"), ("os._exit(3)", "exit status 3"),
@@ -69,3 +69,31 @@ def test_the_process_ends_when_the_one_that_started_it_does(tmp_path):
         assert process.wait() == 0
         timer.cancel()
         process.stdin = None
+
+
+@pytest.mark.parametrize(("photos", "x", "y", "found"), [(12, 550, 430, True), (12, 470, 420, True),
+                                                         (12, 512, 384, False), (6, 550, 430, False)])  # fmt: skip
+def test_principal_points_off_the_middle_are_found_from_ten_photos_on(tmp_path, photos, x, y, found):
+    """COLMAP's synthetic data with noise of half a pixel; cameras start in the middle of 1024 x 768 pixels."""
+    pycolmap.set_random_seed(1)
+    path, out = tmp_path / "x.db", tmp_path / "out"
+    out.mkdir()
+    database = pycolmap.Database.open(path)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=photos, num_points3D=300, camera_params=[1280, x, y, 0.05]
+    )
+    truth = pycolmap.synthesize_dataset(options, database)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), truth, database)
+    for camera in database.read_all_cameras():
+        camera.params = [1228.8, 512, 384, 0]
+        database.update_camera(camera)
+    database.close()
+    done = []
+    colmap_worker.map_photos(done.append, str(out), str(path), photos, seed=0)
+    model = pycolmap.Reconstruction(out / "0")
+    (camera,) = model.cameras.values()
+    assert sum(done) == model.num_reg_images() == photos
+    if found:
+        assert camera.params[1:3] == pytest.approx([x, y], abs=3)
+    else:
+        assert list(camera.params[1:3]) == [512, 384]

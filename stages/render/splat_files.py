@@ -122,6 +122,8 @@ def only_clip(out: Path, renderer: Renderer) -> Clip:
     options = renderer.options
     if len(renderer.clips) > 1 or options.view == "all" or options.depth:
         raise InputError(f"{out}: holds one scene; omit --side-by-side, --view all and --depth")
+    if options.show_forces:
+        raise InputError(f"{out}: holds no arrows; omit --show-forces, or write an image, a video or a page (.html)")
     return renderer.clips[0]
 
 

@@ -193,7 +193,10 @@ def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> For
         raise InputError(f"{where}: {why}; needs obj_id, start, end and force or torque of 3 numbers") from error
     if id not in {o.id for o in objects}:
         raise InputError(f"{where}: obj_id {id - 1} (counted from 0) is object {id}, which this scene does not have")
-    return _checked(Force(id, push, torque, start, end), where)
+    force = _checked(Force(id, push, torque, start, end), where)
+    if not {"force", "torque"} & row.keys():
+        raise InputError(f"{where}: has neither force nor torque; give one of 3 numbers")
+    return force
 
 
 def _floats(values: Sequence[float | int | str]) -> Vector:

@@ -270,6 +270,8 @@ def _parts(value: dict, where: str, folder: Path) -> MaterialChoice:
         try:
             below = number(row["below"], "below", 0) if "below" in row else None
             box = numbers(row["box"], 6, "box") if "box" in row else None
+            if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+                raise ValueError("the first corner of its box must be below the second in x, y and z")
             pinned = flag(row.get("pinned", False), "pinned")
             segment = _segment(row, at, folder)
         except ValueError as error:

@@ -87,6 +87,7 @@ def test_invalid_prompts(prompt, message):
     ('{"a": [{"obj_id": 5, "start": 0, "end": 1}]}', "counted from 0\\) is object 6"),
     ('{"a": [{"obj_id": 0, "start": 1, "end": 0}]}', "the end must come after"),
     ('{"a": [{"obj_id": 0, "start": 0, "end": 1, "force": [1]}]}', "3 numbers"), ('{"a": [7]}', "entry 1"),
+    ('{"a": [{"obj_id": 0, "start": 0, "end": 1, "Force": [0, 0, 1]}]}', "entry 1: has neither force nor torque"),
 ])  # fmt: skip
 def test_invalid_files(tmp_path, text, message):
     file = tmp_path / "f.json"

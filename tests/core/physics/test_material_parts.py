@@ -107,6 +107,7 @@ def test_a_uniform_object_stays_as_it_is():
     ([{"below": 1}, {"material": "soft"}], "part 1: give a material"),
     ([{"below": -1, "material": "steel"}, {"material": "soft"}], "part 1: below is -1"),
     ([{"box": [0, 1], "material": "steel"}, {"material": "soft"}], "part 1: box"),
+    ([{"box": [0, 0, 1, 1, 1, 0], "material": "steel"}, {"material": "soft"}], "part 1: the first corner of its box"),
     ([{"below": 1, "material": "cheese"}, {"material": "soft"}], "part 1: no material called 'cheese'"),
     ([{"segment": "pot", "material": "steel"}, {"material": "soft"}], "part 1: segment .* together"),
     ([{"below": 1, "material": "steel"}, {"in": "parts.ply", "material": "soft"}], "part 2: segment .* together"),

@@ -3,6 +3,7 @@
 import errno
 import gc
 import logging
+import math
 import os
 import re
 import signal
@@ -68,6 +69,8 @@ def with_options(command: Callable) -> Callable:
 
     @wraps(command)
     def call(**values):
+        for name, value in values.items():
+            _check_number(name, value)
         given = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
         built = {name: cls(**{f.name: given[f.name] for f in exposed[name]}) for name, cls in classes.items()}
         return command(**{n: v for n, v in values.items() if n in hints and n not in classes}, **built)
@@ -75,6 +78,12 @@ def with_options(command: Callable) -> Callable:
     call.__signature__ = Signature(list(parameters.values()))
     call.__annotations__ = {name: p.annotation for name, p in parameters.items()}
     return call
+
+
+def _check_number(name: str, value: Any) -> None:
+    """InputError for NaN, which passes comparisons, and for integers beyond 64 bits; ranges are for option classes."""
+    if isinstance(value, float) and math.isnan(value) or isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise InputError(f"--{name.replace('_', '-')} {value}: give {'a' if value != value else 'a smaller'} number")
 
 
 def _parameter(field: Field, kind: type) -> Parameter:

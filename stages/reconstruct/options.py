@@ -25,6 +25,7 @@ FEATURE_MATCHERS = {
 UP_SIDES = ("top", "right", "bottom", "left")  # of photos, where up may be
 SYNCHRONISATIONS = ("motion", "audio")
 SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that accept a single photo
+MAX_ITERATIONS = 1_000_000  # other trainers take 7,000 to 30,000
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,8 @@ class ReconstructOptions:
         if not self.sequence and (self.offsets or self.sync != "motion" or self.fps != type(self).fps):
             raise InputError("--sync, --offsets and --fps: only with --sequence; add it or drop them")
         parse_scale(self.scale_reference)
-        if self.iterations is not None and self.iterations < 0:
-            raise InputError(f"--iterations {self.iterations}: give 0 for none, or more")
+        if self.iterations is not None and not 0 <= self.iterations <= MAX_ITERATIONS:
+            raise InputError(f"--iterations {self.iterations}: give 0 for none, or up to {MAX_ITERATIONS}")
 
     @property
     def preset(self) -> QualityPreset:

@@ -97,6 +97,16 @@ def test_options_of_a_command_are_the_fields_of_its_classes():
     assert "up to five" in call("--help", app=own)[1]
 
 
+@pytest.mark.parametrize("line", [
+    "evaluate a.mp4 --judge --timeout nan", "evaluate a.mp4 --seed 9223372036854775808",
+    "train ngff --data a -o b --minutes nan", "train ngff --data a -o b --lr nan",
+])  # fmt: skip
+def test_numbers_that_no_option_takes(line):
+    words = line.split()
+    status, _, err = call(*words, app=app if words[0] == "evaluate" else lab_app)
+    assert status == 2 and err.strip().startswith(f"ngff: {words[-2]} {words[-1]}: give a")
+
+
 BENCHMARKS = [
     (line.split()[-1], bench) for line, callback in COMMANDS.items() if (bench := getattr(callback, "run", ""))
 ]

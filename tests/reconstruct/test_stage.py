@@ -141,7 +141,12 @@ def test_cameras_of_other_photos_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
-    [({"quality": "best"}, "draft, normal, high"), ({"holdout": 1}, "2 or more"), ({"resolution": 8}, "64 to 4096")],
+    [
+        ({"quality": "best"}, "draft, normal, high"),
+        ({"holdout": 1}, "2 or more"),
+        ({"resolution": 8}, "64 to 4096"),
+        ({"iterations": 10**9}, "or up to 1000000"),
+    ],
 )
 def test_invalid_options(wrong, words):
     with pytest.raises(InputError, match=words):

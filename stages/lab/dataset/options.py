@@ -24,18 +24,26 @@ PREREQUISITES = {  # parts that a part is generated from
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
+MIN_DX = 0.011  # of which the grid of a scene has about 50 million nodes [m]
 MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """Resolution of the simulation in space and time."""
+    """Resolution of the simulation in space and time. Raises InputError for values out of range."""
 
     dx: float = option(0.02, "grid spacing [m]; published: 0.02")
     spacing: float = option(0.009, "spacing of particles on a surface [m]")
     substep: float = option(
         SUBSTEP, "longest simulation time step [s], shortened for stiff light objects; published: 1e-4"
     )
+
+    def __post_init__(self):
+        for name, low, high, unit in (
+            ("dx", MIN_DX, 0.2, "m"), ("spacing", 1e-6, 0.2, "m"), ("substep", 1e-7, FRAME_INTERVAL, "s")
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"--{name} {getattr(self, name):g}: from {low:g} to {high:g} {unit}")
 
     @property
     def substeps(self) -> int:
@@ -67,6 +75,7 @@ class DatasetOptions(Discretisation):
     device: str = device_option()
 
     def __post_init__(self):
+        super().__post_init__()
         parse_parts(self.parts), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
         _parse_shard(self.shard)
         if self.frames < 1 or self.keypoints < 1 or self.limit < 0:
@@ -134,6 +143,9 @@ class HeldoutOptions(Discretisation):
     device: str = device_option()
 
     def __post_init__(self):
+        super().__post_init__()
+        if self.frames < 1 or self.keypoints < 1:
+            raise InputError("--frames and --keypoints must be positive")
         if self.scenes < 1 or not 1 <= self.objects <= 6:
             raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
         if not 0 <= self.shapes <= 1000:

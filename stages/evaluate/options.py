@@ -36,7 +36,7 @@ class EvaluateOptions:
     films_per_question: int = option(4, "with --judge: most films in one question, in random order under letters")
     timeout: float = option(120.0, "with --judge: maximum waiting time for an answer [s]")
     resume: bool = option(False, "with --judge: continue an interrupted run, from the answers it has written")
-    seed: int = option(0, "with --judge: random seed of the order of the films")
+    seed: int = option(0, "with --judge: random seed of the order of the films", min=0)
 
     def __post_init__(self):
         if self.frames is not None and self.frames < 1:

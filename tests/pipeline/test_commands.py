@@ -17,6 +17,7 @@ from ngff_cli import app as commands
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
 from ngff_cli.options import print_results, with_options
+from stages.core.errors import InputError
 from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
 from stages.core.options import option
@@ -105,6 +106,25 @@ def test_numbers_that_no_option_takes(line):
     words = line.split()
     status, _, err = call(*words, app=app if words[0] == "evaluate" else lab_app)
     assert status == 2 and err.strip().startswith(f"ngff: {words[-2]} {words[-1]}: give a")
+
+
+def counts():
+    """(option class, field) of each option that is an integer, of all commands."""
+    for callback in COMMANDS.values():
+        for cls in typing.get_type_hints(inspect.unwrap(callback)).values():
+            if dataclasses.is_dataclass(cls):
+                hints = typing.get_type_hints(cls)
+                yield from ((cls, f) for f in dataclasses.fields(cls) if "help" in f.metadata and hints[f.name] is int)
+
+
+COUNTS = {f"{cls.__name__}-{f.name}": (cls, f) for cls, f in counts()}
+
+
+@pytest.mark.parametrize(("cls", "field"), COUNTS.values(), ids=COUNTS)
+def test_counts_are_not_negative(cls, field):
+    if "min" not in field.metadata:
+        with pytest.raises(InputError):
+            cls(**{field.name: -1})
 
 
 BENCHMARKS = [

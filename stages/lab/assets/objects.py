@@ -61,7 +61,7 @@ class ObjectsOptions:
     """Which objects to write, and how meshes are converted to Gaussians."""
 
     only: str = option("", "names of the objects, such as ball,duck; default: all ten")
-    count: int = option(40_000, "approximate number of Gaussians of a mesh")
+    count: int = option(40_000, "approximate number of Gaussians of a mesh", min=100)
     up: str = option("auto", "up axis of a mesh: auto | x | y | z")
     light: bool = option(True, "bake soft light into the colours of a mesh")
 

@@ -20,7 +20,7 @@ class PhysicsBenchOptions:
     only: str = option("", "experiments by group or pattern, such as slide,'boxes/0.3m*'; default: all")
     engines: tuple[str, ...] = option(("rigid", "mpm", "ngff"), "auto | rigid | mpm | ngff; repeatable", "--engine")
     quality: str = option("draft", "quality of MPM: draft | normal | high")
-    keypoints: int = option(256, "keypoints per object")
+    keypoints: int = option(256, "keypoints per object", min=8)
     weights: Path | None = option(None, "weights of the learned engine; default: those in the package")
     contact: str = option(AUTO, "contacts of the engine ngff: auto | learned | solved")
     device: str = device_option()
@@ -52,9 +52,9 @@ class DynamicsBenchOptions:
 class AblationBenchOptions:
     """Length and data of each training."""
 
-    steps: int = option(1500, "training steps of each ablation")
-    batch: int = option(64, "scenes per training step")
-    keypoints: int = option(256, "keypoints per object")
+    steps: int = option(1500, "training steps of each ablation", min=1)
+    batch: int = option(64, "scenes per training step", min=1)
+    keypoints: int = option(256, "keypoints per object", min=1)
     horizons: str = option("8,20", "rollout length of each training phase [frames]")
     groups: str = option("3_0..3_8", "groups of scenes to train on")
     test: str = option("3_9", "group of scenes to test on")
@@ -68,7 +68,7 @@ class TrackBenchOptions:
     """Which stand-ins are filmed and tracked."""
 
     sequences: int = option(5, "number of sequences")
-    first: int = option(0, "seed of the first sequence")
+    first: int = option(0, "seed of the first sequence", min=0)
     width: int = option(240, "width of the videos [px]")
     frames: int = option(50, "frames of motion")
     quality: str = option(
@@ -89,13 +89,13 @@ class TrackBenchOptions:
 class FitBenchOptions:
     """Scenes, and how each is fitted."""
 
-    scenes: int = option(20, "number of scenes")
+    scenes: int = option(20, "number of scenes", min=1)
     only: str = option("", "some of slide,bounce,collision,soft, alternating; default: all four")
     truth: str = option("", "engine of the motions; default: that which fits them")
-    noise: float = option(0.002, "standard deviation of the tracks' errors [m]")
-    evaluations: int = option(1500, "largest number of simulations of a scene")
-    minutes: float = option(10.0, "longest time of a scene [min]")
-    workers: int = option(2, "processes")
+    noise: float = option(0.002, "standard deviation of the tracks' errors [m]", min=0)
+    evaluations: int = option(1500, "largest number of simulations of a scene", min=1)
+    minutes: float = option(10.0, "longest time of a scene [min]", min=0)
+    workers: int = option(2, "processes", min=1)
     seed: int = seed_option()
     device: str = device_option()
 
@@ -114,7 +114,7 @@ class FilmBenchOptions:
     films: int = option(2, "films per scene")
     width: int = option(320, "width of the films [px]")
     frames: int = option(25, "frames of each film")
-    workers: int = option(2, "processes")
+    workers: int = option(2, "processes", min=1)
     seed: int = seed_option()
     device: str = device_option()
 

@@ -15,7 +15,7 @@ class ReconstructBenchOptions:
     """Options of the reconstruction."""
 
     quality: str = option("normal", "quality of the reconstruction")
-    holdout: int = option(8, "hold out every N-th photo")
+    holdout: int = option(8, "hold out every N-th photo", min=0)
     device: str = device_option()
     matcher: str = option("sift", "features matched between photos: sift | aliked-lightglue")
     cameras_only: bool = option(False, "stop after the cameras are estimated, to compare matchers")
@@ -77,10 +77,10 @@ class SegmentPhotosOptions:
 class SegmentAblationOptions:
     """Length of the trainings."""
 
-    steps: int = option(1500, "training steps of each network")
+    steps: int = option(1500, "training steps of each network", min=1)
     voxels: int = 14_000
-    batch: int = option(4, "crops per step")
-    workers: int = option(0, "processes that prepare crops; 0: the training process itself")
+    batch: int = option(4, "crops per step", min=1)
+    workers: int = option(0, "processes that prepare crops; 0: the training process itself", min=0)
     seed: int = seed_option()
     device: str = device_option()
 
@@ -111,7 +111,7 @@ class RegisterBenchOptions:
     """Objects, number of trials and the damage to each part."""
 
     only: str = option("", "names of the objects, such as ball,duck; default: all ten")
-    trials: int = option(10, "partial views of each object")
+    trials: int = option(10, "partial views of each object", min=1)
     missing: float = 0.4  # fraction of the surface
     noise: float = 0.01  # standard deviation of positions [diameters]
     tint: float = 0.02  # standard deviation of colours [0..1]

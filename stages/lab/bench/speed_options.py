@@ -73,7 +73,7 @@ class ChainBenchOptions:
 
     quality: str = option("normal", "quality of the reconstruction")
     device: str = device_option()
-    steps: int = option(100, "frames of the video")
+    steps: int = option(100, "frames of the video", min=1)
     refine: bool = option(True, "complete the objects before they are simulated")
     repeat: int = option(2, "runs in one process; the first one loads kernels")
     commands: bool = option(True, "also run each stage as a command")
@@ -91,7 +91,7 @@ class ChainTableOptions:
     photos: int = 20
     width: int = 448  # of the photos [px]
     quality: str = option("normal", "quality of the reconstruction")
-    steps: int = option(100, "frames of the video")
+    steps: int = option(100, "frames of the video", min=1)
     repeat: int = option(2, "runs in one process; the first one loads kernels")
     device: str = device_option()
 

@@ -11,7 +11,7 @@ class ClutterOptions:
     """How many scenes, and what they are made of."""
 
     count: int = option(20, "number of scenes")
-    first: int = option(0, "number of the first scene")
+    first: int = option(0, "number of the first scene", min=0)
     views: int = option(12, "photos of each scene")
     size: int = option(512, "longest side of a photo [px]")
     observations: int = option(

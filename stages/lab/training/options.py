@@ -44,6 +44,8 @@ class TrainOptions:
             raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
         if not 0 <= self.sparse_keypoints <= self.keypoints:
             raise InputError(f"--sparse-keypoints {self.sparse_keypoints}: must be between 0 and --keypoints")
+        if self.width < 0:
+            raise InputError(f"--width {self.width}: must be 0 or more")
         if self.velocity_weight < 0:
             raise InputError(f"--velocity-weight {self.velocity_weight}: a time in seconds, or 0")
         if not 0 <= self.gradient_discount <= 1:
@@ -93,8 +95,8 @@ class SplatterOptions:
             raise InputError("--steps, --views and --lr must be positive, --side at least 14")
         if self.depth not in ("network", "given"):
             raise InputError(f"--depth {self.depth}: choose from network, given")
-        if self.width % 16:
-            raise InputError(f"--width {self.width}: must be a multiple of 16")
+        if self.width < 0 or self.width % 16:
+            raise InputError(f"--width {self.width}: must be a multiple of 16, or 0")
 
 
 @dataclass(frozen=True)
@@ -117,3 +119,5 @@ class SegmenterTraining:
     def __post_init__(self):
         if not (self.minutes >= 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
             raise InputError("--rate must be above 0, --minutes 0 or more, --voxels at least 1000, --batch at least 1")
+        if min(self.steps, self.workers) < 0 or min(self.blocks, self.score_scenes) < 1:
+            raise InputError("--steps and --workers must be 0 or more, --blocks and --score-scenes at least 1")

@@ -169,6 +169,12 @@ def test_outputs_of_the_lab_have_the_suffix_of_their_format(input_files, line):
     assert before == {name: (input_files / name).read_bytes() for name in before}
 
 
+@pytest.mark.parametrize("line", ["clutter good.ply", "objects good.ply", "backgrounds good.ply", "dataset good.ply",
+                                  "heldout good.ply"])  # fmt: skip
+def test_folders_of_the_lab_that_are_files_are_reported_before_the_work(line):
+    assert re.search("good.ply.*: is no folder", fails_cleanly(line, lambda *words: call(*words, app=lab_app)))
+
+
 def test_a_file_is_not_rendered_over_itself(input_files):
     before = (input_files / "good.ply").read_bytes()
     assert "is a file that is rendered; name another" in fails_cleanly("render good.ply -o good.ply")

@@ -42,6 +42,17 @@ def check_output(path: Path, *kinds: str) -> None:
         format_of(path, *kinds, writable=True)
 
 
+def make_folder(path: Path) -> Path:
+    """Create a folder to write to, with those above it; InputError, before long work, where that is not possible."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: is no folder and cannot become one ({error.strerror}); name another") from error
+    if not os.access(path, os.W_OK):
+        raise InputError(f"{path}: cannot be written to; change its permissions, or name another folder")
+    return path
+
+
 def check_json_output(path: Path) -> None:
     """As `check_output`, for JSON: InputError for another suffix too, since it might be a file of another kind."""
     check_output(path)

@@ -195,7 +195,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
 
     `only` names some of them, separated by commas. Yields a line per background; raises InputError for unknown names.
     """
-    from stages.core.scene.files import provenance
+    from stages.core.scene.files import make_folder, provenance
     from stages.core.scene.images import write_jpeg
     from stages.core.scene.scene import Scene
     from stages.core.scene.scene_ply import write_scene
@@ -204,6 +204,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
 
     images = []
     names = chosen_names(only, BACKGROUNDS)
+    make_folder(Path(out))
     for name in tqdm(names, desc="backgrounds", unit="background"):
         g = make_background(name)
         folder = Path(out) / name

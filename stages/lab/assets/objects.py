@@ -93,7 +93,7 @@ def run(
 
     Yields a line per object; raises InputError for unknown names, unreadable meshes or two meshes of one name.
     """
-    from stages.core.scene.files import provenance
+    from stages.core.scene.files import make_folder, provenance
     from stages.core.scene.images import write_jpeg
     from stages.lab.assets.mesh_files import find_objects, object_name
     from stages.lab.assets.splat_files import object_portrait, write_object
@@ -110,6 +110,7 @@ def run(
                              "one of them or its folder")  # fmt: skip
         sources[name] = files
     sources = sources or dict.fromkeys(chosen_names(options.only, OBJECTS), ())
+    make_folder(out)
     for name, files in tqdm(sources.items(), desc="objects", unit="object"):
         g = _from_mesh(files, options) if files else make_object(name)
         made_by = provenance("objects", list(files), options) if files else provenance("objects", [])

@@ -23,7 +23,7 @@ from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.geometry.rotations import matrix
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.files import provenance
+from stages.core.scene.files import make_folder, provenance
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.images import write_jpeg
 from stages.core.scene.scene import Scene, SceneObject
@@ -107,6 +107,7 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
     observed_reconstruction.safetensors, of a real one; or with `options.exact` observed_exact.safetensors, of the true
     Gaussians themselves.
     """
+    make_folder(Path(out))
     shelf = Shelf(meshes, options.seed)
     inputs = [f for files in shelf.meshes for f in files]
     for index in tqdm(range(options.first, options.first + options.count), desc="scenes", unit="scene"):

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance
+from stages.core.scene.files import make_folder, provenance
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.assets import backgrounds, objects
 from stages.lab.dataset import manifest
@@ -63,7 +63,7 @@ class DatasetGenerator:
         materials = [(kind.E, kind.density) for kind in objects.OBJECTS.values()]
         self.options = replace(options, substep=stable_substep(options, materials))
         self.layout, self.device = Layout(out), pick_device(options.device)
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         manifest.open_manifest(out, self.options.settings)
 
     @cached_property

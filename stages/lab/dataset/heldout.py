@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance
+from stages.core.scene.files import make_folder, provenance
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES
 from stages.lab.assets.mesh_files import find_objects
 from stages.lab.assets.random_shapes import random_shapes
@@ -52,7 +52,7 @@ def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) ->
     if motions.exists():
         return f"{motions}: exists already"
     for folder in (file.parent, motions.parent):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     device, start = pick_device(options.device), time.perf_counter()
     objects = find_objects(meshes or [])
     assets = _assets(options, objects, Path(out) / f"particles_{name}.npz")

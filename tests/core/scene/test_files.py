@@ -13,7 +13,7 @@ from ngff_cli.options import interrupt
 from stages.core.errors import InputError
 from stages.core.scene import error_deferring_file, files
 from stages.core.scene.error_deferring_file import ErrorDeferringFile
-from stages.core.scene.files import must_exist, replacing, save_tensors, seconds_since
+from stages.core.scene.files import make_folder, must_exist, replacing, save_tensors, seconds_since
 from stages.core.scene.schema import read_json
 from tests.limits import file_size_limit
 
@@ -148,3 +148,14 @@ def test_an_interrupt_waits_until_hdf5_has_written(tmp_path, monkeypatch):
         finally:
             signal.signal(signal.SIGALRM, before)
     assert (tmp_path / "f").read_bytes() == b"abc"
+
+
+def test_folders_are_made_with_those_above_them(tmp_path, monkeypatch):
+    assert make_folder(tmp_path / "a/b").is_dir() and make_folder(tmp_path / "a/b").is_dir()
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path / "file/a"):
+        with pytest.raises(InputError, match=f"{path}: is no folder and cannot become one"):
+            make_folder(path)
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write everywhere
+    with pytest.raises(InputError, match="a: cannot be written to"):
+        make_folder(tmp_path / "a")

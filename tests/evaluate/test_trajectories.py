@@ -194,7 +194,7 @@ def test_missing_objects_are_named_in_the_error(tmp_path, two_balls):
     write_motion(tmp_path / "true.h5", two_balls)
     fewer = replace(two_balls, objects=two_balls.objects[:1])
     write_motion(tmp_path / "mine.h5", fewer)
-    with pytest.raises(InputError, match="has 1 objects .*--objects red ball"):
+    with pytest.raises(InputError, match="has 1 objects .*--objects 'red ball'"):
         evaluate(tmp_path)
     assert list(evaluate(tmp_path, objects="red ball")["objects"]) == ["red ball"]
     with pytest.raises(InputError, match="--objects blue: .* has red ball, green ball"):

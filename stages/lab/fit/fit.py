@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +20,18 @@ from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
-from stages.lab.fit.search import Estimate, Simulations, descend, search, settled, simulations
+from stages.lab.fit.search import (
+    OUTCOME,
+    Estimate,
+    OutOfTime,
+    Simulations,
+    descend,
+    descent_simulations,
+    final_simulations,
+    search,
+    simulations,
+    with_intervals,
+)
 from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -35,25 +48,26 @@ class Fit:
     rmse: tuple[float, float]  # of the motion before and after [unit of the problem]
     evaluations: int
     seconds: float
+    determined: bool = True  # whether intervals were found before the time ended
 
     @property
     def half(self) -> np.ndarray:
-        """Half widths of 95 % intervals [ranges]."""
-        return 1.96 * self.found.deviations
+        """Half widths of 95 % intervals [ranges], infinite where they were not determined."""
+        return 1.96 * self.found.deviations if self.determined else np.full(len(self.found.x), np.inf)
 
     def value(self, k: int) -> float:
         """Of the k-th parameter; log10 of it where it is searched so."""
         return self.problem.parameters[k].value(float(self.found.x[k]))
 
-    def half_width(self, k: int) -> float:
-        """Of its 95 % interval."""
+    def half_width(self, k: int) -> float | None:
+        """Of its 95 % interval; None where that was not determined."""
         p = self.problem.parameters[k]
-        return float(self.half[k]) * (p.high - p.low)
+        return float(self.half[k]) * (p.high - p.low) if self.determined else None
 
     def is_identifiable(self, k: int) -> bool:
         """Whether the motion determines the k-th parameter accurately enough."""
         name = self.problem.parameters[k].name
-        return name in AXES or self.half_width(k) <= QUANTITIES[name].max_half_width
+        return self.determined and (name in AXES or self.half_width(k) <= QUANTITIES[name].max_half_width)
 
 
 def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOptions) -> list[str]:
@@ -62,6 +76,7 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
     `motion` is one trajectory, or films. Raises InputError for a motion that is not of the scene, and MissingPackage
     without the package cma.
     """
+    until = time.perf_counter() + 60 * options.minutes
     check_json_output(out)
     kinds = [format_of(path, "trajectory", "video").kind for path in motion]
     if kinds.count("trajectory") and len(kinds) > 1:
@@ -72,7 +87,7 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
         problem = read_problem(scene, motion[0], options)
     else:
         problem = read_film_problem(scene, motion, options)
-    fit = solve(problem, options)
+    fit = solve(problem, options, until)
     materials, velocity = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
     names = {o.id: o.name for o in fit.problem.scene.objects}
     with replacing(out) as part:
@@ -88,19 +103,22 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
     return [*describe(fit), _command(scene, out, fit, velocity)]
 
 
-def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
+def solve(problem: Problem, options: MaterialFitOptions, until: float | None = None) -> Fit:
     """Search for the parameters, and estimate how accurately the motion determines them.
 
-    Films are compared from the fit of the track on, which was followed through them.
+    Films are compared from the fit of the track on, which was followed through them. No simulation begins after
+    `until`, a time of `time.perf_counter` (by default --minutes from now), but those of the outcome.
     """
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
     begun = time.perf_counter()
-    with simulations(problem.tracked, options.workers) as sims:
+    until = begun + 60 * options.minutes if until is None else until
+    with simulations(problem.tracked, options.workers, until - _kept(problem, until - begun)) as sims:
         fit = _settled(sims, search(sims, options))
     found, count = fit.found, fit.evaluations
     for level in problem.levels:
-        with simulations(level, options.workers) as sims:
+        with simulations(level, options.workers, until) as sims:
+            sims.reserved = final_simulations(len(problem.parameters))
             found = found._replace(x=descend(sims, len(problem.track), found, sims.noise))
             if level is problem:
                 fit = _settled(sims, found)
@@ -108,12 +126,29 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     return replace(fit, evaluations=count, seconds=time.perf_counter() - begun)
 
 
+def _kept(problem: Problem, left: float) -> float:
+    """Time kept for the pictures of films, as one simulation tells, but no more than half of what is left [s]."""
+    if not problem.levels or left <= 0:
+        return 0.0
+    begun, parameters = time.perf_counter(), problem.parameters
+    problem.residuals(problem.motion([p.coordinate(p.start) for p in parameters]))
+    count = len(problem.levels) * descent_simulations(len(parameters)) + final_simulations(len(parameters))
+    return min(count * (time.perf_counter() - begun), left / 2)
+
+
 def _settled(sims: Simulations, found: Estimate) -> Fit:
-    """The fit near an estimate, with its uncertainty."""
-    problem, frames = sims.problem, len(sims.problem.track)
-    found = settled(sims, frames, found, sims.error(found.x, frames))
+    """The fit near an estimate, with its uncertainty if there is time for it."""
+    problem, frames, determined = sims.problem, len(sims.problem.track), False
+    sims.reserved = OUTCOME
+    with suppress(OutOfTime):
+        error = sims.error(found.x, frames)
+        found = found._replace(x=descend(sims, frames, found, error))
+        found, determined = with_intervals(sims, frames, found, error), True
+    sims.until = math.inf
     before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
-    fit = Fit(problem, found, found.x, (before, after), sims.count, 0.0)
+    fit = Fit(problem, found, found.x, (before, after), sims.count, 0.0, determined)
+    if not determined:
+        return fit
     unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
     return replace(fit, accepted=with_initial(found, sims.start, unknown))
 
@@ -144,6 +179,9 @@ def describe(fit: Fit) -> list[str]:
         for k, p in enumerate(fit.problem.parameters):
             if p.object_id == i:
                 (found if fit.is_identifiable(k) else unknown).append(_text(fit, k, p))
+        if not fit.determined:
+            lines.append(f"object {i} ({names[i]}): {', '.join(unknown)}; intervals not determined within --minutes")
+            continue
         line = f"object {i} ({names[i]}): {', '.join(found) or 'nothing is identifiable from the motion'}"
         lines.append(line + (f"; not identifiable from the motion: {', '.join(unknown)}" if unknown else ""))
     lines.append(f"RMSE {fit.rmse[0]:.3g} before, {fit.rmse[1]:.3g} after [{fit.problem.unit}]; {fit.evaluations} "
@@ -157,7 +195,8 @@ def _is_log(p: Parameter) -> bool:
 
 def _text(fit: Fit, k: int, p: Parameter) -> str:
     name = f"velocity {p.name}" if p.name in AXES else f"log10 {p.name}" if _is_log(p) else p.name
-    return f"{name} {fit.value(k):.3g} +- {fit.half_width(k):.2g}"
+    half = fit.half_width(k)
+    return f"{name} {fit.value(k):.3g}" + (f" +- {half:.2g}" if half is not None else "")
 
 
 def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:

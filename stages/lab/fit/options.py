@@ -23,7 +23,7 @@ class MaterialFitOptions:
     resolution: int = option(320, "longest side to which films are reduced [px]")
     noise: float = option(0.0, "standard deviation of the track's errors [scene units]; 0: estimated from it")
     evaluations: int = option(1500, "largest number of simulations")
-    minutes: float = option(10.0, "longest time of the search [min]; intervals take some more")
+    minutes: float = option(10.0, "longest time [min]; intervals that it is too short for are not determined")
     workers: int = option(2, "processes")
     seed: int = seed_option()
     device: str = device_option()

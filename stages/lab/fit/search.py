@@ -14,11 +14,12 @@ filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "T
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,26 @@ ENOUGH = 1.15, 0.0005  # cost at which a fit ends: a factor on that of the track
 SMALLEST = 0.002  # standard deviation of a parameter [ranges]
 SETTLING = 2  # times that the uncertainty is estimated at the end, each with differences of the size of the last
 WIDER = 3.0  # factor on that of the search, from which they start: what is rough looks known by small differences
+OUTCOME = 2  # simulations whose motions are compared with the track at the end: of the initial values and of the result
+
+
+class OutOfTime(Exception):
+    """No simulation begins any more, as its time is over or kept for others."""
+
+
+def descent_simulations(parameters: int) -> int:
+    """The most that `descend` makes."""
+    return STEPS * (1 + 1 + 2 * parameters) + 2
+
+
+def interval_simulations(parameters: int) -> int:
+    """Those that `with_intervals` makes."""
+    return SETTLING * (1 + 2 * len(FAR) * parameters)
+
+
+def final_simulations(parameters: int) -> int:
+    """The most that the end of a fit takes: the error, a descent, the intervals and the outcome."""
+    return 1 + descent_simulations(parameters) + interval_simulations(parameters) + OUTCOME
 
 
 class Estimate(NamedTuple):
@@ -61,16 +82,37 @@ class Estimate(NamedTuple):
 
 
 class Simulations:
-    """Simulates the problem at many points at once and counts them; `map` is that of a pool of processes."""
+    """Simulates the problem at many points at once and counts them; `map` is that of a pool of processes.
 
-    def __init__(self, problem: Problem, map_: Callable):
+    `until` is the time of `time.perf_counter` from which none begins [s]. Time for `reserved` simulations of the whole
+    track is kept before, as measured on those so far, but no more than half of what there was.
+    """
+
+    def __init__(self, problem: Problem, map_: Callable, until: float = math.inf):
         self.problem, self._map, self.count = problem, map_, 0
         self.start = np.array([p.coordinate(p.start) for p in problem.parameters])
+        self.until, self.reserved = until, 0
+        self._half = max(0.0, until - time.perf_counter()) / 2
+        self._seconds, self._frames = 0.0, 0  # of all simulations so far
 
     def residuals(self, points: list[np.ndarray], frames: int) -> list[np.ndarray]:
-        """Residuals in the first frames, at points that are moved into the ranges."""
-        self.count += len(points)
-        return list(self._map(_residuals, [np.clip(x, 0, 1) for x in points], [frames] * len(points)))
+        """Residuals in the first frames, at points that are moved into the ranges. Raises OutOfTime."""
+        found: list[np.ndarray] = []
+        self._check()  # before the pool has anything to do
+        begun = time.perf_counter()
+        for residuals in self._map(_residuals, [np.clip(x, 0, 1) for x in points], [frames] * len(points)):
+            found.append(residuals)
+            self.count += 1
+            self._frames += frames
+            self._seconds, begun = self._seconds + time.perf_counter() - begun, time.perf_counter()
+            if len(found) < len(points):
+                self._check()
+        return found
+
+    def _check(self) -> None:
+        each = self._seconds / max(self._frames, 1) * len(self.problem.track)
+        if time.perf_counter() >= self.until - min(self.reserved * each, self._half):
+            raise OutOfTime
 
     def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
         """Costs of the first frames."""
@@ -106,53 +148,57 @@ def _residuals(x: np.ndarray, frames: int) -> np.ndarray:
 
 
 @contextmanager
-def simulations(problem: Problem, workers: int) -> Iterator[Simulations]:
-    """Simulations of a problem, in `workers` processes if several."""
+def simulations(problem: Problem, workers: int, until: float = math.inf) -> Iterator[Simulations]:
+    """Simulations of a problem until a time, in `workers` processes if several."""
     if workers == 1:
         _set_problem(problem, torch.get_num_threads())
-        yield Simulations(problem, map)
+        yield Simulations(problem, map, until)
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _set_problem, (problem, 1)) as pool:
-        yield Simulations(problem, pool.map)
+        yield Simulations(problem, pool.map, until)
 
 
 def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
-    """Fit increasingly long initial segments of the track. Raises MissingPackage without the package cma."""
-    total, until = len(sims.problem.track), time.perf_counter() + 60 * options.minutes
+    """Fit increasingly long initial segments of the track, in the time that is not kept for the end of the fit.
+
+    Raises MissingPackage without the package cma.
+    """
+    total, sims.reserved = len(sims.problem.track), final_simulations(len(sims.problem.parameters))
     known = Estimate(sims.start, np.diag([p.step for p in sims.problem.parameters]))  # before the present segment
     x, lengths = known.x, [min(FIRST, total)]
     while lengths[-1] < total:
         lengths.append(min(total, max(lengths[-1] + 1, int(GROWTH * lengths[-1]))))
     of_noise = enough = ENOUGH[0] * sims.problem.noise_cost + ENOUGH[1]
-    for k, frames in enumerate(tqdm(lengths, unit="segment")):
-        if time.perf_counter() > until or sims.count > options.evaluations:
-            break
-        if sims.cost(x, frames) < enough:
-            continue
-        x = descend(sims, frames, Estimate(x, known.root), sims.noise)
-        share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)  # few segments need it
-        cost, attempt, idle = sims.cost(x, frames), 0, 0
-        while cost > enough and idle < len(SPREADS) and sims.count < share and time.perf_counter() < until:
-            x = _evolve(sims, frames, x, known, attempt, options)
-            before, cost = cost, sims.cost(x, frames)
-            idle = 0 if cost < (1 - GAIN) * before else idle + 1
-            attempt += 1
-        enough = max(enough, ENOUGH[0] * cost)
-        error = sims.noise if cost < of_noise else sims.error(x, frames)
-        known = narrowed(sims, frames, Estimate(x, known.root), error)
-        log.debug("%d frames, cost %.3g, %d motions: %s", frames, cost, sims.count, x.round(3))
+    with suppress(OutOfTime):
+        for k, frames in enumerate(tqdm(lengths, unit="segment")):
+            if sims.count > options.evaluations:
+                break
+            if sims.cost(x, frames) < enough:
+                continue
+            x = descend(sims, frames, Estimate(x, known.root), sims.noise)
+            share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)  # few segments need it
+            cost, attempt, idle = sims.cost(x, frames), 0, 0
+            while cost > enough and idle < len(SPREADS) and sims.count < share:
+                x = _evolve(sims, frames, x, known, attempt, options)
+                before, cost = cost, sims.cost(x, frames)
+                idle = 0 if cost < (1 - GAIN) * before else idle + 1
+                attempt += 1
+            enough = max(enough, ENOUGH[0] * cost)
+            error = sims.noise if cost < of_noise else sims.error(x, frames)
+            known = narrowed(sims, frames, Estimate(x, known.root), error)
+            log.debug("%d frames, cost %.3g, %d motions: %s", frames, cost, sims.count, x.round(3))
     return Estimate(x, known.root)
 
 
-def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Estimate:
-    """The estimate for an error of a residual [tolerances], with its uncertainty.
+def with_intervals(sims: Simulations, frames: int, known: Estimate, error: float) -> Estimate:
+    """The estimate with its uncertainty for an error of a residual [tolerances]. Raises OutOfTime.
 
     Differences are by one parameter at a time: directions of several, of which one changes the motion roughly and the
     other steadily, tell nothing about each.
     """
-    x, deviations = descend(sims, frames, known, error), WIDER * known.deviations
+    deviations = WIDER * known.deviations
     for _ in tqdm(range(SETTLING), desc="intervals", unit="pass"):
-        known = narrowed(sims, frames, Estimate(x, np.diag(np.minimum(deviations, PRIOR))), error, FAR)
+        known = narrowed(sims, frames, Estimate(known.x, np.diag(np.minimum(deviations, PRIOR))), error, FAR)
         deviations = known.deviations
     return known
 
@@ -160,30 +206,38 @@ def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Es
 def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np.ndarray:
     """The minimum near `known`, by Levenberg and Marquardt's method, or `known.x` itself where the cost does not fall.
 
-    `error` is the standard deviation of a residual [tolerances], against which the prior is weighed.
+    `error` is the standard deviation of a residual [tolerances], against which the prior is weighed. Where the time
+    ends, the best point so far.
     """
-    weight = error / PRIOR
+    weight, part, tried = error / PRIOR, sims.problem.first_frames(frames), [(math.inf, known.x)]
 
     def point(z: np.ndarray) -> np.ndarray:
         return known.x + known.root @ z
 
     def errors(z: np.ndarray) -> np.ndarray:
-        residuals = np.nan_to_num(sims.residuals([point(z)], frames)[0])
-        return np.append(residuals, weight * (point(z) - sims.start))
+        residuals = sims.residuals([point(z)], frames)[0]
+        tried.append((part.cost(residuals), np.clip(point(z), 0, 1)))
+        return np.append(np.nan_to_num(residuals), weight * (point(z) - sims.start))
 
     def derivatives(z: np.ndarray) -> np.ndarray:
         return np.vstack([_derivatives(sims, frames, Estimate(point(z), known.root)), weight * known.root])
 
-    found = least_squares(errors, np.zeros(len(known.x)), derivatives, max_nfev=STEPS, xtol=PRECISION, ftol=FALL)
-    x = np.clip(point(found.x), 0, 1)
-    before, after = sims.costs([known.x, x], frames)
+    try:
+        found = least_squares(errors, np.zeros(len(known.x)), derivatives, max_nfev=STEPS, xtol=PRECISION, ftol=FALL)
+        x = np.clip(point(found.x), 0, 1)
+        before, after = sims.costs([known.x, x], frames)
+    except OutOfTime:
+        return min(tried, key=lambda t: t[0])[1]
     return x if after < before else known.x
 
 
 def _evolve(
     sims: Simulations, frames: int, x: np.ndarray, known: Estimate, attempt: int, options: MaterialFitOptions
 ) -> np.ndarray:
-    """The best of some generations of CMA-ES in units of the uncertainty, from `x` and from `known.x` in turn."""
+    """The best of some generations of CMA-ES in units of the uncertainty, from `x` and from `known.x` in turn.
+
+    Where the time ends, the best so far.
+    """
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it
     except ImportError as error:
@@ -196,13 +250,14 @@ def _evolve(
         "tolfunhist": FALL, "tolfun": FALL,
     })  # fmt: skip
     best, lowest = x, sims.costs([x], frames)[0]
-    while not strategy.stop():
-        steps = strategy.ask()
-        points = [np.clip(middle + known.root @ z, 0, 1) for z in steps]
-        costs = sims.costs(points, frames)
-        strategy.tell(steps, costs)
-        if min(costs) < lowest:
-            best, lowest = points[int(np.argmin(costs))], min(costs)
+    with suppress(OutOfTime):
+        while not strategy.stop():
+            steps = strategy.ask()
+            points = [np.clip(middle + known.root @ z, 0, 1) for z in steps]
+            costs = sims.costs(points, frames)
+            strategy.tell(steps, costs)
+            if min(costs) < lowest:
+                best, lowest = points[int(np.argmin(costs))], min(costs)
     return best
 
 

@@ -14,9 +14,9 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.lab.bench.fit_films import film, filmed_toy
 from stages.lab.fit.film import by_camera, read_film_problem, robust, timing
-from stages.lab.fit.fit import solve
+from stages.lab.fit.fit import _kept, solve
 from stages.lab.fit.options import MaterialFitOptions
-from stages.lab.fit.search import Estimate, descend, simulations
+from stages.lab.fit.search import OUTCOME, Estimate, descend, simulations
 from tests.conftest import CliRunner
 
 OPTIONS = MaterialFitOptions(engine="rigid", workers=1, keypoints=16, resolution=160)
@@ -102,6 +102,21 @@ def test_large_differences_are_bounded():
         1, abs=1e-3
     )
     assert torch.equal(robust(-large), -robust(large))
+
+
+def test_without_time_pictures_determine_no_intervals(slide):
+    """Those of the track before are not given for them."""
+    *_, problem = slide
+    fit = solve(problem, replace(OPTIONS, minutes=1e-6))
+    assert fit.problem is problem and not fit.determined
+    assert [fit.half_width(k) for k in range(4)] == [None] * 4
+    assert fit.evaluations == 2 * OUTCOME  # of the track and of the pictures
+
+
+def test_time_is_kept_for_pictures_but_not_more_than_half(slide):
+    *_, problem = slide
+    assert 0 < _kept(problem, 1e9) < 1e6 and _kept(problem, 1e-3) == 5e-4
+    assert _kept(problem.tracked, 1e9) == 0
 
 
 @pytest.mark.slow

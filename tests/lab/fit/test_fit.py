@@ -20,11 +20,26 @@ from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.experiments.bodies import Run, ball, block
 from stages.lab.fit import search
 from stages.lab.fit.alignment import aligned
-from stages.lab.fit.fit import Fit, _command, run, solve, with_initial
+from stages.lab.fit.fit import Fit, _command, _settled, run, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import _first_velocity, estimate_noise, pose_problem, read_problem
-from stages.lab.fit.search import PRIOR, Estimate, Simulations, _derivatives, _evolve, descend, narrowed, simulations
+from stages.lab.fit.search import (
+    OUTCOME,
+    PRIOR,
+    Estimate,
+    OutOfTime,
+    Simulations,
+    _derivatives,
+    _evolve,
+    descend,
+    descent_simulations,
+    final_simulations,
+    interval_simulations,
+    narrowed,
+    simulations,
+    with_intervals,
+)
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner, ring
@@ -295,7 +310,8 @@ class Ramp:
     """A track (k frames) of a height that no motion reaches, where a ramp has two parameters; stands for a Problem."""
 
     noise_level, noise_cost = 1e-3, 1e-6
-    parameters = [SimpleNamespace(start=0.2, step=0.2, coordinate=lambda value: value) for _ in range(2)]
+    parameters = [SimpleNamespace(name=name, low=0.0, high=1.0, start=0.2, step=0.2, coordinate=lambda value: value)
+                  for name in ("friction", "loss")]  # fmt: skip
 
     def __init__(self, frames: int = 40):
         self.track = np.arange(frames) / 40
@@ -311,6 +327,9 @@ class Ramp:
 
     def error(self, residuals: np.ndarray) -> float:
         return float(np.square(residuals).sum() ** 0.5)
+
+    def rmse(self, residuals: np.ndarray) -> float:
+        return float(np.square(residuals).mean() ** 0.5)
 
 
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
@@ -328,3 +347,70 @@ def test_a_track_that_the_engine_cannot_follow_to_its_noise_is_followed_to_its_e
     np.testing.assert_allclose(found.x, [0.6, 0.4], atol=0.02)
     assert (found.deviations > 0.002).all()  # by more than the noise, and less than before
     assert (found.deviations < 0.15).all()
+
+
+@pytest.fixture
+def ramps(monkeypatch):
+    """A function of an end that makes simulations of a ramp, of a second for all frames, until it; and their clock."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(search, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+
+    def simulated(_, points, frames):
+        for x, n in zip(points, frames, strict=True):
+            clock.now += n / 40
+            yield Ramp(n).residuals(x)
+
+    return lambda until: Simulations(Ramp(), simulated, until), clock
+
+
+def test_the_simulations_of_the_end_of_a_fit_are_known_beforehand(ramps):
+    sims = ramps[0](np.inf)
+    near = Estimate(np.array([0.3, 0.6]), 0.2 * np.eye(2))
+    descend(sims, 40, near, sims.noise)
+    assert len(near.x) < sims.count <= descent_simulations(2)
+    before = sims.count
+    with_intervals(sims, 40, near, sims.noise)
+    assert sims.count - before == interval_simulations(2)
+    before = sims.count
+    _settled(sims, near)
+    assert interval_simulations(2) < sims.count - before <= final_simulations(2)
+
+
+@pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
+@pytest.mark.parametrize(("until", "determined"), [(0, False), (10, False), (40, False), (150, True), (400, True)])
+def test_a_fit_and_its_intervals_end_in_time(until, determined, ramps):
+    """Or the intervals are not determined: none is of half of the differences."""
+    make, clock = ramps
+    sims = make(until)
+    fit = _settled(sims, search.search(sims, replace(OPTIONS, evaluations=10_000)))
+    assert clock.now <= until + (OUTCOME if until < 2 * OUTCOME else 1)
+    assert fit.determined == determined
+    if determined:
+        assert (abs(fit.found.x - [0.6, 0.4]) < fit.half).all() and (fit.half < 0.5).all()
+    else:
+        assert fit.half_width(0) is None and not fit.is_identifiable(0)
+        np.testing.assert_array_equal(fit.accepted, fit.found.x)
+
+
+def test_what_was_found_before_the_time_ended_stays(ramps):
+    """A descent that ends early is no worse than its start."""
+    make, clock = ramps
+    start = Estimate(np.array([0.9, 0.9]), 0.2 * np.eye(2))
+    sims = make(20)
+    x = descend(sims, 40, start, sims.noise)
+    assert clock.now == 20
+    with pytest.raises(OutOfTime):
+        sims.cost(x, 40)
+    sims.until = np.inf
+    assert sims.cost(x, 40) < sims.cost(start.x, 40) / 10
+
+
+def test_the_command_says_which_intervals_the_time_did_not_allow(bounce, tmp_path, device):
+    out = tmp_path / "m.json"
+    words = ["fit", bounce / "scene.ply", bounce / "track.h5", "-o", out, "--workers", 1, "--minutes", 1e-6]
+    done = CliRunner().invoke(app, [str(word) for word in [*words, "--device", device]])
+    assert done.exit_code == 0, done.output
+    assert "object 1 (body1): friction" in done.stdout and "not determined within --minutes" in done.stdout
+    assert "+-" not in done.stdout
+    rows = json.loads(out.with_suffix(".fit.json").read_text())["parameters"]
+    assert [(row["half_width"], row["identifiable"]) for row in rows] == [(None, False)] * 2

@@ -200,7 +200,7 @@ def release_time(track: TrackedMotion) -> float:
         first = next((t for t in range(1, len(drop)) if drop[t, i] < drop[t - 1, i] or not track.confidence[t, i]),
                      len(drop))  # fmt: skip
         fallen = drop[:first, i].clamp_min(0).sqrt().cpu()
-        used = torch.arange(2, min(first, 2 + FALLING))
+        used = torch.arange(2, max(2, min(first, 2 + FALLING)))
         if len(used) < FALLING:
             continue
         design = torch.stack([used.float(), torch.ones(len(used))], 1)

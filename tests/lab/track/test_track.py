@@ -237,6 +237,7 @@ def test_the_release_is_where_a_fall_begins():
     fall = [max(t - 0.4, 0.0) ** 2 * 0.002 for t in range(12)]
     assert release_time(motion([1 - x for x in fall], [1.0] * 12)) == pytest.approx(0.4, abs=0.02)
     assert release_time(motion([1 - 0.001 * t for t in range(12)], [1.0] * 12)) == 0  # it does not fall freely
+    assert release_time(motion([1 - x for x in fall], [1.0] + [0.0] * 11)) == 0  # it is lost at once
 
 
 def test_a_sighting_between_lost_frames_must_last():

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.scene import Scene
 from stages.lab.track.alignment import Observation, align, change_of, robust_weights
+from stages.lab.track.colours import LaterColours
 from stages.lab.track.confidence import confidences, differences, scales, tolerances
 from stages.lab.track.film_masks import UNKNOWN
 from stages.lab.track.films import Film
@@ -59,6 +60,7 @@ class Tracker:
         first = self.observe(0, JUDGING, self.still, self.still)
         self.scale = scales(differences(self.synthesiser, first, self.rest))
         self.tolerance = tolerances(self._wrong(first[:: math.ceil(len(first) / WRONG_VIEWS)]), self.scale)
+        self.colours = LaterColours(self.synthesiser, self.observe(0, 1, self.still, self.still), self.tolerance)
 
     def _wrong(self, first: list[Observation]) -> list[list[Tensor]]:
         """Differences to pictures of the release where all objects are turned wrongly."""
@@ -111,6 +113,10 @@ class Tracker:
         found = differences(self.synthesiser, self.observe(frame, JUDGING, *motion), poses)
         return confidences(found, self.tolerance)
 
+    def learn(self, frame: int, poses: Poses, motion: tuple[Tensor, Tensor], followed: Tensor) -> None:
+        """Colours of what was not seen before, from the pictures of a frame, of objects that were followed to it."""
+        self.colours.learn(self.observe(frame, 1, *motion), poses, followed)
+
 
 def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"], timed: bool = False) -> TrackedMotion:
     """The motion of all objects from their places in the scene, with confidences.
@@ -136,6 +142,7 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
     share, number = tracker.judge(0, rest, (velocity, velocity))
     poses, shares, pixels = [rest], [share], [number]
     last, missing = rest, torch.zeros_like(velocity[:, 0])  # where last seen, and how many frames ago
+    streak = missing  # for how many frames it has been seen
     for frame in tqdm(range(1, frames), desc="tracking", unit="frame", leave=False):
         away, motion, usual = missing.cpu() > 0, (velocity, velocity), _usual(torch.stack(shares))
         n = (missing + 1)[:, None]
@@ -162,7 +169,8 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
         poses.append(_choose(lost, last, found))
         shares.append(share)
         pixels.append(number)
-        last, missing = poses[-1], torch.where(lost, missing + 1, 0.0)
+        last, missing, streak = poses[-1], torch.where(lost, missing + 1, 0.0), torch.where(lost, 0.0, streak + 1)
+        tracker.learn(frame, last, (velocity, velocity), streak >= LASTING)
     return TrackedMotion(Poses.stack(poses), lasting(torch.stack(shares)), torch.stack(pixels), {})
 
 

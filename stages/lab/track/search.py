@@ -113,7 +113,7 @@ def _places(
     reach = min(MAX_REACH, 4 + 2 * missing)
     steps = torch.arange(-reach, reach + 1, device=tracker.device) * size / 2
     places = middle + torch.cartesian_prod(steps, steps, steps)
-    palette, paint = tracker.synthesiser.palettes[i], tracker.synthesiser.paint
+    palette, paint = tracker.synthesiser.palette(i), tracker.synthesiser.paint
     votes, views = torch.zeros(len(places)).to(places), torch.zeros(len(places)).to(places)
     for o in seen:
         drawn = o.draw(tracker.synthesiser, gone)

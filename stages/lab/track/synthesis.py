@@ -55,6 +55,7 @@ class Synthesis:
     label: Int[Tensor, "h w"]  # row of the object, -1: background
     moving: Int[Tensor, "h w"]  # the same, with the frontmost of the neighbours on outlines
     point: Float[Tensor, "h w 3"]  # of the object in `moving`, in the world
+    depth: Float[Tensor, "h w"]  # of what `label` says
 
 
 class Synthesiser:
@@ -74,8 +75,6 @@ class Synthesiser:
         self.rest = torch.stack([_middle(x) for x in means])
         self.sizes = torch.stack([(x - c).norm(dim=1).quantile(0.9) for x, c in zip(means, self.rest, strict=True)])
         self.arm = self.rest_gaussians.means - self.rest[self.row]
-        colours = C0 * self.rest_gaussians.sh[:, 0] + 0.5
-        self.palettes = [_palette(colours[self.row == i]) for i in range(len(ids))]
         self.colour = torch.tensor(scene.background or (0.0, 0.0, 0.0), device=device)
         self.device = device
         self.paint = MASK_CONTRAST * spread_directions(len(ids)).to(device) if labelled else None
@@ -84,6 +83,22 @@ class Synthesiser:
         """The channels of a label image: rows of objects, -1 for the background, -2 for what is not known (nan)."""
         values = torch.cat([self.paint, self.paint.new_full((1, 3), torch.nan), self.paint.new_zeros(1, 3)])
         return values[label.long()]
+
+    @property
+    def colours(self) -> Float[Tensor, "n 3"]:
+        """Of the Gaussians of the objects, without what depends on the view."""
+        return C0 * self.rest_gaussians.sh[:, 0] + 0.5
+
+    def palette(self, i: int) -> Float[Tensor, "k 3"]:
+        """The most frequent colours of an object."""
+        return _palette(self.colours[self.row == i])
+
+    def recolour(self, rows: Int[Tensor, "m"], colours: Float[Tensor, "m 3"]) -> None:
+        """Give Gaussians of the objects these colours, in all views."""
+        sh = self.rest_gaussians.sh.clone()
+        sh[rows] = 0.0
+        sh[rows, 0] = (colours - 0.5) / C0
+        self.rest_gaussians = replace(self.rest_gaussians, sh=sh)
 
     def at_rest(self) -> Poses:
         """The poses of the scene file."""
@@ -118,7 +133,7 @@ class Synthesiser:
         source = source[0, 0]
         K = resize(camera.K, 1 / reduction, 1 / reduction)
         point = _points(camera.viewmat, K, -nearest[0, 0], source)
-        return Synthesis(reduced(image, reduction), label, label.flatten()[source], point)
+        return Synthesis(reduced(image, reduction), label, label.flatten()[source], point, depth)
 
 
 def reduced(image: Float[Tensor, "h w c"], reduction: int) -> Float[Tensor, "h2 w2 c"]:

@@ -93,18 +93,19 @@ class Simulations:
         self.start = np.array([p.coordinate(p.start) for p in problem.parameters])
         self.until, self.reserved = until, 0
         self._half = max(0.0, until - time.perf_counter()) / 2
-        self._seconds, self._frames = 0.0, 0  # of all simulations so far
+        self._seconds, self._frames = 0.0, 0  # of all simulations after the first ones, which wait for the processes
 
     def residuals(self, points: list[np.ndarray], frames: int) -> list[np.ndarray]:
         """Residuals in the first frames, at points that are moved into the ranges. Raises OutOfTime."""
         found: list[np.ndarray] = []
         self._check()  # before the pool has anything to do
-        begun = time.perf_counter()
+        begun, measured = time.perf_counter(), self.count > 0
         for residuals in self._map(_residuals, [np.clip(x, 0, 1) for x in points], [frames] * len(points)):
             found.append(residuals)
             self.count += 1
-            self._frames += frames
-            self._seconds, begun = self._seconds + time.perf_counter() - begun, time.perf_counter()
+            if measured:
+                self._frames += frames
+                self._seconds, begun = self._seconds + time.perf_counter() - begun, time.perf_counter()
             if len(found) < len(points):
                 self._check()
         return found

@@ -17,7 +17,7 @@ from stages.core.kernels.threads import parallel_map
 from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from stages.core.physics.keypoints import farthest_points
-from stages.core.physics.rigid_shapes import balls, convex_hulls
+from stages.core.physics.rigid_shapes import convex_hulls, rigid_shapes
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.scene import Scene
 from stages.simulate.model_units import ModelUnits
@@ -35,7 +35,7 @@ def body_surfaces(
     com = centre_of_mass(initial, initial.points)
     arms = torch.where(initial.valid[..., None], initial.points - com[:, :, None], 0.0)[0]
     floor = float(floors.min())
-    found, hulls = balls(scene, seed, floor), convex_hulls(scene, seed, floor)
+    found, hulls = rigid_shapes(scene, seed, floor), convex_hulls(scene, seed, floor)
 
     def grid(row: int) -> BodyGrid:
         start = units.to_model(lift[row]) - com[0, row]  # of the origin of the scene, in the body's frame
@@ -43,10 +43,14 @@ def body_surfaces(
             solid_surface(scene, scene.objects[row].id, seed).fitted, hulls[row], float(floors[row])
         )
         out = _grid(shape, arms[row, initial.valid[0, row]], start, units.length, seed)
-        if (ball := found[row]) is None:
+        ball, cylinder = found[row].ball, found[row].cylinder
+        if (solid := ball or cylinder) is None:
             return out
-        centre = start + units.length * torch.from_numpy(ball.centre).float()
-        return replace(out, ball=(centre, units.length * ball.radius))
+        centre, radius = start + units.length * torch.from_numpy(solid.centre).float(), units.length * solid.radius
+        if cylinder is None:
+            return replace(out, ball=(centre, radius))
+        axis = torch.from_numpy(cylinder.axis).float()
+        return replace(out, cylinder=(centre, axis, radius, units.length * cylinder.height / 2))
 
     grids = parallel_map(grid, range(len(scene.objects)))
     surfaces = BodySurfaces.of(grids)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,17 @@ from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
-from stages.lab.bench.experiments.bodies import Run, ball, bowl, compound, tilted
+from stages.lab.bench.experiments.bodies import (
+    Run,
+    Specimen,
+    about_z,
+    ball,
+    bowl,
+    compound,
+    cylinder,
+    on_slope,
+    tilted,
+)
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.experiments.friction import ladder_angle
 from stages.lab.bench.motion_options import PhysicsBenchOptions
@@ -27,11 +38,50 @@ SOLVED = PhysicsBenchOptions(contact="solved")
 
 @pytest.mark.parametrize(
     "name", ["bounce/friction=0.5 loss=0.15", "slope/25deg friction=0.3", "slide/stool on shelf friction=0.6",
-             "collision/row of five"]
+             "collision/row of five", "pile/three logs"]
 )  # fmt: skip
 def test_agrees_with_theory_where_learned_contact_does_not(device, name):
     experiment = experiments()[name]
     assert experiment.passes("ngff", measure(experiment, "ngff", SOLVED)["value"])
+
+
+@pytest.mark.parametrize("degrees", [10.0, 25.0])
+def test_a_cylinder_rolls_down_a_slope(device, degrees):
+    """By g sin(degrees) t^2 / 3, straight; a polyhedron loses energy at each edge."""
+    run = on_slope(degrees, 0.02, {}, cylinder(0.1, 0.3, 0.01).moved((0.0, 0.0, 0.1)))
+    options = SimulateOptions(engine="ngff", contact="solved", steps=31, keypoints=64, pin=("1",), device=device)
+    t = roll_out(run.scene(), options)
+    way = t.com[-1, 1] - t.com[0, 1]
+    assert float(way.norm()) == pytest.approx(9.81 * math.sin(math.radians(degrees)) * 0.6**2 / 3, rel=0.01)
+    assert abs(float(way[1])) < 1e-3
+
+
+def test_a_cylinder_rolls_on_the_floor_at_two_thirds_of_its_speed(device):
+    scene = Run((Specimen(about_z(cylinder(0.1, 0.3, 0.01), 33.0).moved((0.0, 0.0, 0.1))),)).scene()
+    options = SimulateOptions(engine="ngff", contact="solved", steps=60, keypoints=64, velocity=("object=1 1,0,0",),
+                              friction=0.0, device=device)  # fmt: skip
+    assert float(roll_out(scene, options).com[-1, 0, 0]) == pytest.approx(59 * 0.02, rel=1e-3)  # it slides
+    along = math.cos(math.radians(33.0)), math.sin(math.radians(33.0))
+    options = replace(options, velocity=(f"object=1 {along[0]},{along[1]},0",), friction=0.5)
+    t = roll_out(scene, options)
+    assert float((t.com[-1, 0] - t.com[-11, 0]).norm()) == pytest.approx(2 / 3 * 0.2, rel=5e-3)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_what_stands_and_lies_on_cylinders_stays(device, upright):
+    """A small box on a can, and a plank over the middle of a pinned log, in balance."""
+    can = cylinder(0.1, 0.3, 0.01)
+    if upright:
+        can = Surface(can.points[:, [0, 2, 1]], can.normals[:, [0, 2, 1]])
+        bodies = can.moved((0.0, 0.0, 0.15)), box((0.06, 0.06, 0.06), 0.005).moved((0.03, 0.0, 0.33))
+    else:
+        bodies = can.moved((0.0, 0.0, 0.1)), box((0.5, 0.1, 0.04), 0.008).moved((0.0, 0.0, 0.22))
+    scene = Run(tuple(Specimen(b) for b in bodies)).scene()
+    pins = () if upright else ("1",)
+    t = roll_out(
+        scene, SimulateOptions(engine="ngff", contact="solved", steps=50, keypoints=64, pin=pins, device=device)
+    )
+    assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 2e-3
 
 
 def test_a_light_ball_between_heavy_ones_keeps_momentum_and_gains_no_energy(device, tmp_path):

@@ -21,6 +21,7 @@ from stages.core.kernels.field.near_points import (
     in_body_frame,
     plane_gap,
     plane_near,
+    sample_at_plane,
     sample_near,
 )
 from stages.core.kernels.field.surface_lookup import SurfaceArrays, beyond_grid, nearest_node
@@ -99,16 +100,16 @@ def _look_at(w: CollisionWorld, scene: int, pair: int, q: int):
     if w.surfaces.near[a, q] == NONE:
         return
     margin = _margin(w.motion, scene, a, b)
-    at = w.motion.com[scene, a] + w.motion.R[scene, a] * w.surfaces.samples[a, q]
     if a == b:
         least = margin  # of a sample near several planes the nearest one counts
         for side in range(SIDES):
-            gap = plane_gap(w.motion, scene, a, side, at)
+            gap = plane_gap(w.motion, scene, a, side, sample_at_plane(w.surfaces, w.motion, scene, a, side, q))
             if gap < least:
                 least = gap
                 w.found.gap[scene, pair, q] = gap
                 w.found.side[scene, pair, q] = wp.int8(side)
         return
+    at = w.motion.com[scene, a] + w.motion.R[scene, a] * w.surfaces.samples[a, q]
     x = in_body_frame(w.motion, scene, b, at)
     if beyond_grid(w.surfaces, b, x) < margin:
         point = sample_near(w.surfaces, w.motion, scene, a, b, q)

@@ -20,6 +20,10 @@ MIN_FACING = wp.constant(0.3)
 OPPOSED, CURVED, FACES = wp.constant(faces.OPPOSED), wp.constant(faces.CURVED), wp.constant(faces.FACES)
 STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
 THINNEST = wp.constant(2.0)  # a way that may lead through a wall, in nodes of the grid: sheets have three voxels
+ON_SIDE = wp.constant(0.98)  # distance from the axis of a cylinder beyond which samples are on its side [radii]
+TURNED = wp.constant(0.5)  # least cosine of the angle by which a sample is moved around an axis
+SMALL = wp.constant(0.25)  # size of a body below which it may be between the samples of a cylinder [its size]
+LEANING = wp.constant(0.1)  # sine of the angle to an axis below which a direction is along it
 NO_DISTANCE = wp.constant(1e-6)  # in radii of a ball, that has no direction
 
 
@@ -104,14 +108,114 @@ def _ends_at_face(
 
 
 @wp.func
+def _turned(s: SurfaceArrays, a: int, q: int, direction: wp.vec3) -> wp.vec4:
+    """Sample q of body a in its frame, and whether it is moved: around the axis of a cylinder as far in a direction as
+    its circle goes, since cylinders touch along a line and not where there is a sample.
+    """
+    x = s.samples[a, q]
+    out = wp.vec4(x[0], x[1], x[2], 0.0)
+    if s.side[a] > 0.0:
+        along = wp.dot(x - s.centre[a], s.axis[a])
+        on_axis = s.centre[a] + along * s.axis[a]
+        across = direction - wp.dot(direction, s.axis[a]) * s.axis[a]
+        length = wp.length(across)
+        if length > LEANING and wp.length(x - on_axis) > ON_SIDE * s.side[a]:
+            across = across / length
+            if wp.dot(wp.normalize(x - on_axis), across) > TURNED:
+                x = on_axis + s.side[a] * across
+                out = wp.vec4(x[0], x[1], x[2], 1.0)
+    return out
+
+
+@wp.func
+def sample_at_plane(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, side: int, q: int) -> wp.vec3:
+    """Where sample q of body a would touch a plane of its room."""
+    x = _turned(s, a, q, -(wp.transpose(motion.R[scene, a]) * _inward(side)))
+    return motion.com[scene, a] + motion.R[scene, a] * wp.vec3(x[0], x[1], x[2])
+
+
+@wp.func
+def _at_side(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
+    """Direction out of the side of a cylinder b at x in its frame, and the distance from it [m]; the distance is
+    infinite where an end is nearer, or b is no cylinder.
+    """
+    out = wp.vec4(0.0, 0.0, 0.0, NO_CONTACT)
+    if s.side[b] > 0.0:
+        along = wp.dot(x - s.centre[b], s.axis[b])
+        outward = x - s.centre[b] - along * s.axis[b]
+        gap = wp.length(outward) - s.side[b]
+        if gap > wp.abs(along) - s.half[b]:
+            outward = wp.normalize(outward)
+            out = wp.vec4(outward[0], outward[1], outward[2], gap)
+    return out
+
+
+@wp.func
+def _at_surface(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
+    """Direction out of body b at x in its frame, that of a face if there is one, and the distance from it [m]."""
+    out = _at_side(s, b, x)
+    if out[3] == NO_CONTACT:
+        found = depth_at(s, b, x)
+        outward = -wp.normalize(wp.vec3(found[0], found[1], found[2]))
+        gradient = outward
+        r = s.nearest[nearest_node(s, b, x)]
+        most = OPPOSED
+        if r >= 0:
+            for j in range(FACES):
+                if wp.dot(gradient, s.faces[r, j]) > most:
+                    most = wp.dot(gradient, s.faces[r, j])
+                    outward = s.faces[r, j]
+        out = wp.vec4(outward[0], outward[1], outward[2], -found[3])
+    return out
+
+
+@wp.func
+def _side_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
+    """Sample q of a cylinder a, moved around its axis, at body b; the gap is infinite where it is not moved."""
+    out = NearPoint()
+    out.a = a
+    out.b = b
+    out.gap = NO_CONTACT
+    out.facing = True
+    R = motion.R[scene, b]
+    at = s.samples[a, q]
+    if s.side[b] > 0.0:  # what faces the other axis is nearest to it
+        at = s.centre[a] + wp.dot(at - s.centre[a], s.axis[a]) * s.axis[a]
+    is_moved = bool(True)
+    i = int(0)
+    while i < 3:  # faces are only known near a surface; not a range, which would be unrolled
+        place = motion.com[scene, a] + motion.R[scene, a] * at
+        found = _at_surface(s, b, in_body_frame(motion, scene, b, place))
+        normal = R * wp.vec3(found[0], found[1], found[2])
+        if i < 2:
+            moved = _turned(s, a, q, -(wp.transpose(motion.R[scene, a]) * normal))
+            at = wp.vec3(moved[0], moved[1], moved[2])
+            is_moved = is_moved and moved[3] > 0.0
+        elif is_moved:
+            out.at = place
+            out.normal = normal
+            out.gap = s.overlap[a, b] + found[3]
+        i += 1
+    return out
+
+
+@wp.func
 def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
     """Sample q of body a at body b."""
+    if s.side[a] > 0.0:
+        moved = _side_near(s, motion, scene, a, b, q)
+        if moved.gap < NO_CONTACT:
+            return moved
     out = NearPoint()
     out.a = a
     out.b = b
     R = motion.R[scene, b]
     out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
     x = in_body_frame(motion, scene, b, out.at)
+    is_flat = s.flatness[s.point[a, q]] > 1.0 - CURVED and s.side[a] == 0.0
+    if is_flat and s.side[b] > 0.0 and s.reach[a] > SMALL * s.reach[b]:  # samples of the cylinder touch the face
+        out.gap = NO_CONTACT
+        return out
     found = depth_at(s, b, x)
     now = found[3]
     way = _way_of_a_step(motion, scene, a, b, out.at)
@@ -219,7 +323,7 @@ def plane_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, side: i
     if s.radius[a] > 0.0:
         out.at = motion.com[scene, a] + motion.R[scene, a] * s.centre[a] - s.radius[a] * out.normal
     else:
-        out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
+        out.at = sample_at_plane(s, motion, scene, a, side, q)
     out.gap = plane_gap(motion, scene, a, side, out.at)
     out.facing = True
     return out

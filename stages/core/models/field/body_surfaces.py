@@ -36,6 +36,8 @@ class BodyGrid:
     faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
     nearest: Int[Tensor, "x y z"]  # point nearest to each node; -1 far from the surface
     ball: tuple[Float[Tensor, "3"], float] | None = None  # its centre and radius, if the body is one
+    # the centre, the axis and radius and half the height, if the body is a solid cylinder
+    cylinder: tuple[Float[Tensor, "3"], Float[Tensor, "3"], float, float] | None = None
     hull: Float[Tensor, "f 4"] = torch.zeros(0, 4)  # normals and offsets of its faces, if it is convex
 
 
@@ -57,8 +59,11 @@ class BodySurfaces:
     flatness: Float[Tensor, "p"]  # of the surfaces at points: 1 in a plane and 0 at an edge
     faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
     nearest: Int[Tensor, "g"]  # point nearest to each node; -1 far from the surface
-    centre: Float[Tensor, "o 3"]  # of a ball
+    centre: Float[Tensor, "o 3"]  # of a ball or a solid cylinder
     radius: Float[Tensor, "o"]  # of a ball; 0 for other bodies
+    axis: Float[Tensor, "o 3"]  # of a solid cylinder
+    side: Float[Tensor, "o"]  # radius of a solid cylinder; 0 for other bodies
+    half: Float[Tensor, "o"]  # half its height
     hull: Float[Tensor, "h 4"]  # normals and offsets of the faces of convex bodies [1, m]
     hull_first: Int[Tensor, "o"]  # row of each body's first face
     hull_faces: Int[Tensor, "o"]  # number of faces; 0 of bodies that are not convex
@@ -80,13 +85,19 @@ class BodySurfaces:
         none = at.new_zeros(3), 0.0
         hulls = torch.tensor([len(g.hull) for g in grids])
         balls = [none if g.ball is None else g.ball for g in grids]
+        no_tube = at.new_zeros(3), at.new_zeros(3), 0.0, 0.0
+        cylinders = [no_tube if g.cylinder is None else g.cylinder for g in grids]
         return cls(
             **flat, first=sizes.cumsum(0) - sizes, shape=torch.tensor([g.depth.shape for g in grids]),
             low=torch.stack([g.low for g in grids]), spacing=at.new_tensor([g.spacing for g in grids]),
             near=near, samples=at, normals=normals, point=first[:, None] + point,
             flatness=torch.cat([g.flatness for g in grids]), faces=torch.cat([g.faces for g in grids]),
             nearest=torch.cat(nearest),
-            centre=torch.stack([centre for centre, _ in balls]), radius=at.new_tensor([radius for _, radius in balls]),
+            centre=torch.stack([ball[0] + tube[0] for ball, tube in zip(balls, cylinders, strict=True)]),
+            radius=at.new_tensor([radius for _, radius in balls]),
+            axis=torch.stack([axis for _, axis, _, _ in cylinders]),
+            side=at.new_tensor([radius for _, _, radius, _ in cylinders]),
+            half=at.new_tensor([half for _, _, _, half in cylinders]),
             hull=torch.cat([g.hull for g in grids]), hull_first=hulls.cumsum(0) - hulls, hull_faces=hulls,
             reach=at.norm(dim=-1).amax(-1), overlap=at.new_zeros(len(grids), len(grids)),
         )  # fmt: skip

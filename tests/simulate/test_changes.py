@@ -119,17 +119,17 @@ def test_a_fine_setup_has_half_the_spacing_and_the_same_mass(apart):
 
 
 def test_bodies_end_where_their_lowest_voxels_are_filled(apart, monkeypatch):
-    """Columns of voxels of edge .1, of the lowest of which the upper 30 % are filled, end .03 above the floor."""
-    h = 0.1
-    x = h * torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.arange(5.0))
-    volume = h**3 * torch.where(x[:, 2] == 0, 0.3, 1.0)
-    x[:, 2] += 0.03 + (0.3 - 0.5) * h  # what is filled is below the upper face, half an edge above the centre
+    """Columns of voxels of edge .1, of the lowest of which the upper 30 % are filled, end .07 above the floor."""
+    h, rng = 0.1, torch.Generator().manual_seed(0)
+    cells = torch.cartesian_prod(torch.arange(4), torch.arange(4), torch.arange(5))
+    volume = h**3 * torch.where(cells[:, 2] == 0, 0.3, 1.0)
+    x = h * (cells + 0.5 + 0.5 * (torch.rand(cells.shape, generator=rng) - 0.5))
     body = Bodies(x, torch.zeros(len(x), dtype=torch.int64), volume, h)
     monkeypatch.setattr("stages.simulate.setup.sample_bodies", lambda *_, **__: body)
     monkeypatch.setattr("stages.simulate.setup.surface_particles", lambda *_, **__: body)
     one = replace(apart, gaussians=apart.gaussians[apart.gaussians.object_id == 1], objects=apart.objects[:1])
     placed = set_up_scene(one, ForcePrompts(), SimulateOptions(quality="draft"), refinement=1)
-    assert placed.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, -0.03], abs=1e-6)
+    assert placed.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, -0.07], abs=1e-6)
 
 
 def test_only_what_is_below_the_floor_after_a_lift_is_placed_on_it(apart):

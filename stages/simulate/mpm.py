@@ -174,7 +174,7 @@ def _particles(
             if m.E > E:
                 message += f"; Young's modulus reduced from {m.E:.2g} to {E:.2g} Pa for --quality {options.quality}"
             if m.loss > 1.05 * loss:
-                message += f"; loss factor reduced from {m.loss:.2g} to {loss:.2g} for --quality {options.quality}"
+                message += f"; loss factor reduced from {m.loss:.2g} to {loss:.2g}"
             if not len(rows):
                 message = f"object {o.id} ({o.name}): nothing of it is in the part of {part.name}"
             log.info("%s", message)

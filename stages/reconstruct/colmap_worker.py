@@ -22,7 +22,7 @@ from stages.reconstruct.colmap import import_pycolmap
 
 Progress = Callable[[int], None]
 MIN_SHARING = 10  # photos of a camera whose principal point is refined
-MIN_GAIN = 0.03  # of the reprojection error; 0 to .012 in four sets of whole photos, .07 and .12 in two of cropped ones
+MIN_GAIN = 0.03  # of the reprojection error: 0 to .012 in four sets of whole photos, .01, .07, .12 in cropped ones
 
 
 def extract_features(progress: Progress, folder: str, names: list[str], threads: int) -> None:

@@ -1,7 +1,8 @@
-"""Closing the shell of an object in voxels, and filling what it encloses.
+"""Close the voxel shell of an object and fill its interior.
 
-Shells of Gaussians have gaps, holes and often no underside. Gaps are closed, and what is enclosed but for the floor,
-narrow leaks or an unseen underside is filled; an open bowl stays hollow. Sheets are thickened to three voxels.
+Shells of Gaussians have gaps, holes and often no underside. Gaps are closed by morphological closing. A cavity is
+filled if it is enclosed, or open only at the floor, at an unseen underside or through narrow leaks; an open bowl stays
+hollow. Sheets are thickened to three voxels.
 """
 
 from __future__ import annotations
@@ -15,30 +16,31 @@ from scipy import ndimage
 
 from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 
-MIN_PARTICLES = 40  # per object
+MIN_PARTICLES = 40  # least particles of an object
 MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
-LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
-MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
-STRAY = 0.01  # fraction of an object's points that may be below it, and of voxels in which others may be
-UNDERSIDE = 0.02  # quantile of the heights of points at which an unseen underside begins: walls are ragged below
-FULLER = 1.5  # ratio of volumes above which it closes an object: then it makes a body of a shell
+LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the leaks in shells that are sealed [voxels]
+MIN_CAVITY_RATIO = 1.5  # least half width of a cavity relative to that of its leaks
+STRAY = 0.01  # tolerated fraction of an object's points below it, and of its filled voxels with points of other objects
+UNDERSIDE = 0.02  # quantile of the points' heights at which an unseen underside is closed: walls are ragged below it
+FULLER = 1.5  # closing the underside must increase the volume by this factor: then it turns a shell into a solid
 
 
 class SurfaceCloud(NamedTuple):
-    """Points of an object's surface, and where it may be closed."""
+    """Points on an object's surface, with the gaps to be closed. Lengths are in the unit of the points."""
 
     points: np.ndarray  # (n, 3)
-    gap: float  # between points
-    hole: float  # the widest gap of a closed surface
-    others: np.ndarray | None  # (k, 3) points of other objects, where its unseen sides are missing
+    gap: float  # usual gap between points
+    hole: float  # widest gap between points on a closed surface
+    others: np.ndarray | None  # (k, 3) points of other objects; None if the object has no missing unseen sides
 
 
 def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
+    """The closed and filled body of an object as a mask (x, y, z) of voxels of edge h, and the index (3,) of the first.
 
-    It is filled as one that hangs, or closed from below by the `floor` on which it stands: what fills more. Photos show
-    no undersides of what is at rest, and only parts of the surface around them. So those with `others` are also closed
-    where that becomes sparse, whatever they lie on, if it makes a body of a shell and the others are not inside.
+    It is filled with its underside open and, if it stands on `floor`, with its underside closed by the floor; the
+    larger body is kept. Photos do not show the underside of an object at rest, and only parts of the surface just above
+    it. With `others`, the body is therefore also filled with its underside closed at the height where its points become
+    sparse. That body is kept if it is much larger and contains almost no points of other objects.
     """
     points, others = cloud.points, cloud.others
     cells = np.floor(points / h).astype(np.int64)
@@ -61,9 +63,9 @@ def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.
     body = filled(None, LEAK_RADII, widest)
     lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
     if floor is not None:
-        # gaps that closing just misses leak too, but folds of a cloth on the floor look like cavities with wide holes
+        # only leaks just wider than the closing: folds of a cloth on the floor would look like cavities with wide leaks
         body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
-    most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # voxels that any way fills
+    most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # upper bound of the filled volume
     if others is not None and most > FULLER * body.sum():
         below = max(lowest, int(np.quantile(cells[:, 2], UNDERSIDE)))
         other = filled(below, LEAK_RADII, sealed=True)
@@ -75,7 +77,7 @@ def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.
             body = other
     thick = opened(body)
     thin = body & ~thick
-    fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet
+    fringe = thin & surrounded(thick)  # remains of the trimming at edges, not sheets
     body, thin = body & ~fringe, thin & ~fringe
     if thin.any():
         body |= dilated(thin)
@@ -88,9 +90,9 @@ def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.
 def _fill(
     shell: np.ndarray, wide: np.ndarray, gap: int, bottom: int | None, leaks: Sequence[int], sealed: bool
 ) -> np.ndarray:
-    """The shell with gaps closed and the enclosed volume filled; `wide` is within `gap` of it.
+    """The shell with gaps closed and the enclosed volume filled; `wide` is the shell dilated by `gap` voxels.
 
-    `bottom` is the layer that closes it from below, against wide leaks too if it is `sealed`; `leaks` as for _cavities.
+    Layers up to `bottom` close it from below; if `sealed`, they also bound leaky cavities. `leaks` as in `_cavities`.
     """
     walls = wide.copy()
     if bottom is not None:
@@ -107,14 +109,14 @@ def _fill(
 
 
 def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
-    """Cavities with leaks narrower than the cavity by MIN_CAVITY_RATIO: a jug is filled, a mug or a bowl is not.
+    """Cavities wider than their leaks by MIN_CAVITY_RATIO: a jug is filled, a mug or a bowl is not.
 
-    Reconstructed shells have holes; left hollow, they would crumple like paper bags. `leaks` are the half widths of the
-    holes to close [voxels], increasing.
+    Reconstructed shells have holes; left hollow, they would crumple. `leaks` are the half widths of the leaks to seal
+    [voxels], in increasing order.
     """
     if not walls.any():
         return walls
-    box = ndimage.find_objects(walls.view(np.uint8))[0]  # what is free on its faces is so further out too
+    box = ndimage.find_objects(walls.view(np.uint8))[0]  # everything outside the bounding box is free
     inner = walls[box]
     away = squared_distances(inner, math.ceil(MIN_CAVITY_RATIO * leaks[-1]))
     filled = np.zeros_like(inner)
@@ -123,17 +125,17 @@ def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
         hollow = free & ~_outside(free) & ~filled
         if (hollow & wide).any():
             hollow = _components_with(hollow, wide)
-            room = leak + 1  # margin, beyond which all is free
+            room = leak + 1  # margin beyond which every voxel is free
             outside = _outside(squared_distances(np.pad(inner, room), leak) > leak**2)
             from_outside = squared_distances(outside, room)[room:-room, room:-room, room:-room]
-            filled |= _components_with(~inner & (from_outside > room**2), hollow)  # to the walls, not through the leaks
+            filled |= _components_with(~inner & (from_outside > room**2), hollow)  # up to the walls, not into the leaks
     out = np.zeros_like(walls)
     out[box] = filled
     return out
 
 
 def _components_with(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The connected components of the free voxels that contain a seed."""
+    """The connected components of `free` that contain a seed."""
     labels, count = ndimage.label(free)
     kept = np.zeros(count + 1, bool)
     kept[labels[free & seeds]] = True
@@ -152,10 +154,10 @@ def _outside(free: np.ndarray) -> np.ndarray:
 
 
 def _trim(body: np.ndarray, offset: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Remove outermost voxels of thick parts whose centre lies outside the surface.
+    """Remove the outermost voxels of thick parts whose centre lies outside the surface.
 
-    Otherwise a body would grow by half a voxel all around. Points on the surface are at `offset` (n, 3) from the
-    centres of the voxels `at` (n,) of the flat grid [voxels].
+    Otherwise a body would grow by half a voxel all around. The surface points are at `offset` (n, 3) from the centres
+    of the voxels with flat indices `at` (n,) [voxels].
     """
     skin = thick_skin(body)
     some = skin.ravel()[at]
@@ -166,7 +168,7 @@ def _trim(body: np.ndarray, offset: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def thick_skin(body: np.ndarray) -> np.ndarray:
-    """The outermost voxels where the body is at least five voxels thick."""
+    """The outermost voxels of the parts that are at least five voxels thick."""
     core = eroded(body, 2)
     return body & ~eroded(body) & dilated(core, 3)
 

@@ -1,6 +1,6 @@
 """Rigid colliders of the MPM solver: half-spaces, spheres and boxes, fixed or with prescribed motion.
 
-A collider must be at least four grid cells thick: its outermost cell belongs to the bodies in contact with it.
+A collider must be at least four grid cells thick, because its outermost cell belongs to the bodies in contact with it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Vector = tuple[float | int, float | int, float | int]
 
 @dataclass(frozen=True)
 class Collider:
-    """A rigid obstacle. Raises InputError for an unknown kind or surface, without a size, and for wrong coefficients.
+    """A rigid obstacle. Raises InputError for an unknown kind or surface, a missing size or coefficients out of range.
 
-    Bodies in contact may `separate` again, with Coulomb friction; `slip` without friction or separation; or stick to a
-    `sticky` surface.
+    Surfaces: `separate` lets bodies separate and has Coulomb friction, `slip` has neither separation nor friction, and
+    bodies stick to a `sticky` one.
     """
 
     kind: str  # plane, sphere or box

@@ -1,13 +1,14 @@
-"""Whether the surface of a convex object is that of a solid cylinder, and which one.
+"""Fit a solid cylinder to the surface of a convex object, and decide whether the object is one.
 
-The cylinder whose surface is the nearest, by the mean absolute distance of the points, is fitted from the principal
-directions of the points and of the area of their convex hull. The axis is one of them: at the height at which all
-directions across a cylinder are the same to one of both, 1.7 and 2 radii, they are not to the other.
+The cylinder of least mean absolute distance to the surface points is fitted from several initial axes: the principal
+directions of the points, and of the normals of their convex hull weighted by area. One of these is the axis: the
+principal directions are undetermined for the points only at a height of 1.7 radii, and for the normals only at 2 radii.
 
-As for balls (`ball_fit.py`), noise differs from one place to the next and another shape does not: so the median
-distance of neighbours has to be small, on the curved side and on each end, since ends fit whatever stands between
-them. The limits are those of balls: a prism of eight sides is no cylinder, one of twelve is. Of a thin plate all points
-are near the ends of a disc around it, which it does not fill.
+As for balls (`ball_fit.py`), reconstruction noise varies from place to place while the deviation of another shape does
+not. The median distance over neighbouring points must therefore be small on the curved side and on each end; each part
+is tested by itself, since the ends fit whatever shape is between them. The limits are those of balls: a prism of eight
+sides is not accepted as a cylinder, one of twelve sides is. A thin plate has all its points near the ends of a disc
+around it; it is rejected because it does not fill the disc.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from scipy.spatial import ConvexHull, cKDTree
 from stages.core.kernels.threads import small_operations
 from stages.core.physics.ball_fit import CONVERGED, MAX_POINTS, MAX_STEPS, SHARES
 
-NEIGHBOURS = 20  # points of which the median distance counts, as many as there are in a direction of a ball
-FILLED = 0.9  # least fraction of a cylinder that the hull fills: .95 of the one around a prism of twelve sides
-MIN_POINTS = 4  # on the side and on each end: three are on one plane anyway
+NEIGHBOURS = 20  # points over which the median distance is taken, as many as per direction of a ball
+FILLED = 0.9  # least fraction of the cylinder that the hull fills; a prism of twelve sides fills .95
+MIN_POINTS = 4  # least points on the curved side and on each end: three always lie on one plane
 Vector = Float[np.ndarray, "3"]
 
 
@@ -38,23 +39,23 @@ class Cylinder:
 
     @property
     def volume(self) -> float:
-        """Volume."""
+        """Volume [scene units^3]."""
         return np.pi * self.radius**2 * self.height
 
     @property
     def inertia(self) -> Float[np.ndarray, "3 3"]:
-        """Inertia tensor about its centre at density 1."""
+        """Inertia tensor about the centre at density 1 [scene units^5]."""
         along, across = self.radius**2 / 2, self.radius**2 / 4 + self.height**2 / 12
         return self.volume * (across * np.eye(3) + (along - across) * np.outer(self.axis, self.axis))
 
     def rims(self, count: int) -> Float[np.ndarray, "n 3"]:
-        """Points on the edges of both ends, `count` on each."""
+        """Points on the rims of both ends, `count` on each."""
         turn = 2 * np.pi * np.arange(count) / count
         ring = self.centre + self.radius * np.column_stack([np.cos(turn), np.sin(turn)]) @ _across(self.axis)
         return np.concatenate([ring + half * self.axis for half in (-self.height / 2, self.height / 2)])
 
     def distances(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Distances from the surface, negative inside, and which part is meant: 0 the side, -1 and 1 the ends."""
+        """Signed distances from the surface, negative inside, and the nearest part: 0 curved side, -1 and 1 ends."""
         along = (points - self.centre) @ self.axis
         beside = np.linalg.norm((points - self.centre) @ _across(self.axis).T, axis=1) - self.radius
         beyond = np.abs(along) - self.height / 2
@@ -63,7 +64,7 @@ class Cylinder:
 
 @small_operations()
 def fitted_cylinder(points: Float[np.ndarray, "n 3"], hull: ConvexHull) -> Cylinder | None:
-    """The cylinder on whose surface those points lie; None where there is none. `hull` is their convex hull."""
+    """The cylinder on whose surface the points lie, or None. `hull` is their convex hull."""
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
     fits = (_least_absolute_distances(points, axis) for axis in _principal_axes(points, hull))
     fits = (c for c in fits if c is not None and hull.volume >= FILLED * c.volume)
@@ -83,7 +84,7 @@ def fitted_cylinder(points: Float[np.ndarray, "n 3"], hull: ConvexHull) -> Cylin
 
 
 def _principal_axes(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
-    """Unit vectors (6, 3): principal directions of points, and of the normals of their hull by area."""
+    """Unit vectors (6, 3): principal directions of the points, and of the area-weighted normals of their hull."""
     corners = hull.points[hull.simplices]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -92,9 +93,9 @@ def _principal_axes(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
 
 
 def _least_absolute_distances(points: np.ndarray, axis: np.ndarray) -> Cylinder | None:
-    """The cylinder of least mean absolute distance to points, from this axis; None where it vanishes.
+    """The cylinder of least mean absolute distance to the points, starting from `axis`; None if it shrinks to nothing.
 
-    By iteratively reweighted Gauss-Newton steps.
+    Minimised by iteratively reweighted Gauss-Newton steps.
     """
     frame = np.concatenate([_across(axis), axis[None]])
     ends = np.stack([(points @ frame.T).min(0), (points @ frame.T).max(0)])
@@ -107,7 +108,7 @@ def _least_absolute_distances(points: np.ndarray, axis: np.ndarray) -> Cylinder 
         outward = (x @ across.T) @ across
         outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12 * c.radius)
         along, side = x @ c.axis, (part == 0)[:, None]
-        # derivatives of the distances by the centre, the axis (along `across`), the radius and half the height
+        # derivatives of the distances with respect to the centre, the axis (along `across`), radius and half height
         A = np.column_stack([
             -np.where(side, outward, part[:, None] * c.axis),
             np.where(side, -along[:, None] * (outward @ across.T), part[:, None] * (x @ across.T)),
@@ -126,5 +127,5 @@ def _least_absolute_distances(points: np.ndarray, axis: np.ndarray) -> Cylinder 
 
 
 def _across(axis: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3) across one."""
+    """Two unit vectors (2, 3) perpendicular to `axis` and to each other."""
     return np.linalg.svd(axis[None])[2][1:]

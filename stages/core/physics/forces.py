@@ -1,8 +1,8 @@
 """Force prompts: forces, pins, initial velocities and lifts, the same for every engine.
 
-Forces are in newtons, torques in newton metres, times in seconds; points, velocities and lifts in scene units.
-The JSON format of NGFF, {scene name: [{obj_id, start, end, force?, torque?}]}, counts obj_id from 0: its object i is
-object i + 1 here, where 0 is the background.
+Forces are in newtons, torques in newton metres, times in seconds; points, velocities and lifts in scene units. The JSON
+format of NGFF, {scene name: [{obj_id, start, end, force?, torque?}]}, numbers objects from 0: its object i is object
+i + 1 here, where 0 is the background.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class Force:
     at: Vector | None = None  # point of application on the object at rest [scene units]; None: the whole object
 
     def active_fraction(self, start: float, end: float) -> float:
-        """Fraction of the time from `start` to `end` [s] during which it acts."""
+        """Fraction of the interval from `start` to `end` [s] during which the force acts."""
         return max(0.0, min(self.end, end) - max(self.start, start)) / (end - start)
 
 
 @dataclass(frozen=True)
 class Change:
-    """A condition that changes during the simulation, with the frame that begins at `start` [s]."""
+    """A condition that changes during the simulation, at the frame that begins at `start` [s]."""
 
     what: str  # key of CHANGES in stages/core/scene/prompt_rows.py
     value: float | str | bool
@@ -52,7 +52,7 @@ class Change:
 
 @dataclass(frozen=True)
 class ForcePrompts:
-    """Forces and constraints given by the user; false if there are none. Objects by id."""
+    """Forces and constraints given by the user, by object id; false if there are none."""
 
     forces: tuple[Force, ...] = ()
     pinned: frozenset[int] = frozenset()  # from the start
@@ -66,7 +66,7 @@ class ForcePrompts:
     def during(self, start: float, end: float) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
         """Forces that may act, and changes that take effect, in the frame from `start` to `end` [s].
 
-        Engines ask once for each frame, in order, before they compute it.
+        Engines call this once per frame, in order, before they compute the frame.
         """
         return self.forces, tuple(c for c in self.changes if start <= c.start < end)
 
@@ -84,7 +84,7 @@ class ForcePrompts:
 
     @classmethod
     def from_dicts(cls, rows: Sequence[dict]) -> ForcePrompts:
-        """The inverse of `as_dicts`. Raises ValueError for rows that are none of its."""
+        """The inverse of `as_dicts`. Raises ValueError for malformed rows."""
         of: dict[str, list[dict]] = {kind: [] for kind in FIELDS}
         for row in read_prompts(rows):
             of[row.pop("kind")].append(row)
@@ -101,10 +101,10 @@ def parse(
     objects: Sequence[SceneObject], force: Sequence[str] = (), pin: Sequence[str] = (), velocity: Sequence[str] = (),
     lift: Sequence[str] = (), stored: ForcePrompts = ForcePrompts(),  # noqa: B008 -- frozen
 ) -> ForcePrompts:  # fmt: skip
-    """Parse the prompts of the command line, and add them to `stored` ones; objects are given by id or name.
+    """Parse the prompts of the command line, which give objects by id or name, and merge them with `stored` ones.
 
-    Lifts of named objects count before that of all. Raises InputError for malformed prompts, unknown objects, and two
-    velocities or lifts of an object.
+    The lift of a named object overrides that of all objects. Raises InputError for malformed prompts, unknown objects,
+    and two velocities or lifts of one object.
     """
     return ForcePrompts(
         (*(_force(text, objects) for text in force), *stored.forces),
@@ -167,7 +167,7 @@ def _lifts(texts: Sequence[str], objects: Sequence[SceneObject]) -> dict[int, fl
 
 
 def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> list[Force]:
-    """Forces of one scene from a JSON file in the format of NGFF; a file of a single scene matches any name.
+    """Read the forces of one scene from a JSON file in the format of NGFF; a file with a single scene matches any name.
 
     Raises InputError for malformed files and unknown objects.
     """
@@ -204,7 +204,7 @@ def _floats(values: Sequence[float | int | str]) -> Vector:
 
 
 def vector(text: str, where: str) -> Vector:
-    """Three comma-separated numbers; `where` prefixes the InputError if malformed."""
+    """Parse three comma-separated numbers; `where` prefixes the InputError for malformed text."""
     try:
         return _floats(text.split(","))
     except ValueError as error:
@@ -212,7 +212,7 @@ def vector(text: str, where: str) -> Vector:
 
 
 def number(text: str, where: str) -> float:
-    """One finite number; `where` prefixes the InputError if malformed."""
+    """Parse one finite number; `where` prefixes the InputError for malformed text."""
     try:
         value = float(text)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Keypoints, which carry the motion of the objects, and the binding of Gaussians to them."""
+"""Choose the keypoints that carry the motion of the objects, and bind Gaussians to them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from stages.core.scene.trajectory import Binding, Keypoints
 
 KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that each Gaussian follows
 MAX_CANDIDATES = 30_000  # Gaussians of an object among which keypoints are chosen
-EQUALLY_FAR = 0.9999  # ratio of squared distances above which they count as equal
-PULL_MARGIN = 0.15  # between the walls and the points to which a user can pull objects [extent of all objects]
+EQUALLY_FAR = 0.9999  # ratio of two squared distances above which they count as equal
+PULL_MARGIN = 0.15  # distance from the walls within which a user cannot pull objects [extent of all objects]
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> Int[Tensor, "k"]:
-    """Indices of min(count, n) points, each the farthest from those before it, starting from a random point.
+    """Farthest-point sampling: indices of min(count, n) points, starting from a random one.
 
-    Of points that are equally far, the first is taken, so that rounding does not choose between them. Source: Gonzalez
-    1985, "Clustering to minimize the maximum intercluster distance": within a factor of two of the smallest possible
-    covering radius.
+    Of equally far points the first is taken, so that rounding does not decide. The covering radius is within a factor
+    of two of the smallest possible. Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance".
     """
     count, xyz = min(count, len(points)), np.ascontiguousarray(points.detach().cpu().numpy().T)
     chosen = np.empty(count, np.int64)
@@ -35,7 +34,7 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
     distance = np.full(xyz.shape[1], np.inf, xyz.dtype)
     offset, square, far = np.empty_like(xyz), np.empty_like(distance), np.empty(xyz.shape[1], bool)
     at = int(torch.randint(xyz.shape[1], (1,), generator=torch.Generator().manual_seed(seed)))
-    for i in range(count):  # in place: for most objects the overhead of the calls dominates
+    for i in range(count):  # in place, because call overhead dominates for most objects
         chosen[i] = at
         np.subtract(xyz, xyz[:, at, None], out=offset)
         np.square(offset, out=offset)
@@ -47,9 +46,10 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
 
 
 def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
-    """At most `count` keypoints per object, farthest-point samples of its usable Gaussians without outliers.
+    """At most `count` keypoints per object, by farthest-point sampling of its usable Gaussians without outliers.
 
-    Objects without Gaussians get none; those of which only a point would be left keep the other Gaussians.
+    Outliers and unusable Gaussians are kept if otherwise only a single point would be left. Objects without Gaussians
+    get no keypoints.
     """
     g = scene.gaussians.to("cpu")
     good = usable(g)
@@ -74,7 +74,7 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
 
 
 def _is_point(means: Float[Tensor, "k 3"]) -> bool:
-    """Whether these have no extent, as one or none has, so that no size and no rotation can be told from them."""
+    """Whether the points have no extent (all equal, or none), so that they determine neither size nor rotation."""
     return not bool((means != means[:1]).any())
 
 
@@ -96,10 +96,10 @@ def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:
 def nearest_weights(
     points: Float[Tensor, "n 3"], queries: Float[Tensor, "m 3"], k: int
 ) -> tuple[Int[Tensor, "m k"], Float[Tensor, "m k"]]:
-    """The k nearest points of each query, and weights that sum to one.
+    """Indices of the k nearest points of each query, and weights that sum to one.
 
-    Weights are (1 - (d / r)^2)^2 with r the distance to the (k+1)-th neighbour, so they are continuous where the set of
-    neighbours changes. With fewer than k points, the surplus columns have weight 0.
+    The weights are (1 - (d / r)^2)^2 with r the distance to the (k+1)-th neighbour, so they are continuous where the
+    set of neighbours changes. With fewer than k points, the surplus columns have weight 0.
     """
     distance, index = knn(points, queries, k + 1)
     have = min(k, len(points))
@@ -111,7 +111,7 @@ def nearest_weights(
 
 
 def pull_range(keypoints: Keypoints, low: Sequence[float], high: Sequence[float]) -> tuple[tuple, tuple]:
-    """Lower and upper corner of the region to which a user can pull objects, within the walls `low` and `high`.
+    """Lower and upper corner of the region within which a user can pull objects, inside the walls `low` and `high`.
 
     All in scene units.
     """

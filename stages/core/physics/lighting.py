@@ -1,4 +1,4 @@
-"""The light of a scene, estimated from the shadows that its objects cast on the supporting surface."""
+"""Estimate the light of a scene from the shadows that its objects cast on the supporting surface."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, blocked
 from stages.core.scene.gaussians import SURFACE_OPACITY
 from stages.core.scene.scene import Scene
 
-ELEVATIONS, AZIMUTHS, SPREADS = (25.0, 40.0, 55.0, 70.0), 12, (0.1, 0.3)  # lamps that are tried [degrees], [tangents]
-SURFACE_MARGIN = 3.0  # of the surface that is examined [radii of the object], beyond the object
-BENEATH = 0.6  # of the sky blocked: beneath an object, not seen in any photo
-MIN_CELLS = 60  # of the surface around the objects
-MAX_SHARE = 0.95  # of the irradiance that sky and lamp have together
-MIN_SHARE = 0.1  # of the irradiance: fainter shadows cannot be told from the texture
-MIN_ODDS = 0.1  # variance of log colour around the objects that the shadows explain, over what is left
-MIN_RATIO = 4.0  # of these odds to those of displaced shadows
-MIN_NOISE = 0.01  # of log colours
+ELEVATIONS, AZIMUTHS, SPREADS = (25.0, 40.0, 55.0, 70.0), 12, (0.1, 0.3)  # candidate lamps [degrees], number, [tangent]
+SURFACE_MARGIN = 3.0  # width of the examined surface around an object [radii of the object]
+BENEATH = 0.6  # fraction of the sky blocked above which a cell is beneath an object, where no photo shows it
+MIN_CELLS = 60  # least number of visible cells around the objects
+MAX_SHARE = 0.95  # largest fraction of the irradiance from sky and lamp together
+MIN_SHARE = 0.1  # least fraction of the irradiance from sky and lamp: fainter shadows are lost in the texture
+MIN_ODDS = 0.1  # least ratio of the variance of log colour that the shadows explain to the residual variance
+MIN_RATIO = 4.0  # least ratio of these odds to the odds of displaced shadows
+MIN_NOISE = 0.01  # lower bound of the residual scale [log colour]
 MIN_BENEATH = 0.05  # smallest Light.beneath
-MAX_CELLS = 4000  # of the surface that are fitted
-DARKEST = 0.01  # linear colours below are noise
-CONTROLS, CONTROL_SHIFT = 8, 0.7  # fits of displaced shadows, by this [mean distance of the cells from their centre]
-STEPS = 6  # of the robust fit
+MAX_CELLS = 4000  # most cells in the fit
+DARKEST = 0.01  # linear colour below which values are noise
+CONTROLS, CONTROL_SHIFT = 8, 0.7  # number of displaced shadows, and their shift [mean distance of cells from centre]
+STEPS = 6  # iterations of the robust fit
 
 
 def estimate_light(scene: Scene, spheres: Spheres, device: str = "cpu") -> Light:
-    """The light whose shadows of the objects at rest explain the colours of the surface best; OVERHEAD where none does.
+    """The light whose shadows of the objects at rest best explain the colours of the surface; OVERHEAD if none does.
 
-    Log colours of the cells of the supporting surface around the objects are fitted by the surface's own colour and the
-    shadows of a sky and of one of many lamps. They count as found if the same shadows, displaced, explain much less.
+    The log colours of the cells of the supporting surface around the objects are fitted by the surface's own colour and
+    the shadows of a sky and of one of many candidate lamps. The fit is accepted if the same shadows, displaced, explain
+    much less. `spheres` approximate the objects.
     """
     support = find_support(scene)
     if support is None:
@@ -64,14 +65,14 @@ def estimate_light(scene: Scene, spheres: Spheres, device: str = "cpu") -> Light
 
 
 def _hidden(points: Tensor, spheres: Spheres, light: Light) -> Float[Tensor, "n 2"]:
-    """Fractions of the sky and of the lamp that are blocked at points of the surface."""
+    """Fractions of the sky and of the lamp that are blocked at points on the surface."""
     return torch.stack(blocked(points, torch.zeros(len(points)).to(spheres.object_id), spheres, light), 1)
 
 
 def _surface_cells(
     scene: Scene, support: Support, spheres: Spheres
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Centres of the cells of bare surface around the objects, and the logarithm of their linear colours."""
+    """Centres of the cells of the uncovered surface around the objects, and the logarithm of their linear colours."""
     g = scene.gaussians.to("cpu")
     near = torch.zeros(len(g), dtype=torch.bool)
     for id in spheres.object_id.unique():
@@ -94,9 +95,9 @@ def _surface_cells(
 
 
 def _surface_terms(points: Tensor, colours: Tensor) -> tuple[Float[Tensor, "n"], Float[Tensor, "n k"]]:
-    """Log brightness, and terms of the surface's own: of second degree in x and y, and in log chromaticity.
+    """Log brightness, and regressors for the surface's own colour: quadratic in x and y, and in log chromaticity.
 
-    Shadows leave the chromaticity unchanged, so that it tells a texture from a shadow.
+    Shadows leave the chromaticity unchanged, so it distinguishes texture from shadow.
     """
     x, y = ((points[:, :2] - points[:, :2].mean(0)) / points[:, :2].std().clamp_min(1e-9)).unbind(1)
     brightness = colours.mean(1)
@@ -112,7 +113,7 @@ def _all_around(count: int) -> list[tuple[float, float]]:
 
 
 def _lamps() -> list[Light]:
-    """The lamps that are tried, with any strength."""
+    """The candidate lamps; their strengths are fitted."""
     directions = [(0.0, 0.0, 1.0)]
     for elevation in map(math.radians, ELEVATIONS):
         level = math.cos(elevation)
@@ -121,15 +122,15 @@ def _lamps() -> list[Light]:
 
 
 class _LampFit(NamedTuple):
-    odds: float  # variance that the shadows explain over what is left
+    odds: float  # variance that the shadows explain over the residual variance
     light: Light
     own: Tensor  # coefficients of the surface's own colour
 
 
 def _best_fit(A: Tensor, hidden: Float[Tensor, "l n 2"], y: Tensor, lamps: list[Light]) -> _LampFit:
-    """The lamp that explains log colours y best, with its strength and that of the sky, by Tukey's biweight.
+    """Fit the log colours y with each lamp by Tukey's biweight, and return the best fit.
 
-    y = A a + log(1 - hidden s) is linearised about the shares s of sky and lamp in every step, for all lamps at once.
+    y = A a + log(1 - hidden s) is linearised about the fractions s of sky and lamp in each step, for all lamps at once.
     """
     A, y, hidden = A.double().expand(len(lamps), -1, -1), y.double().expand(len(lamps), -1), hidden.double()
     weights, s = torch.ones_like(y), y.new_zeros(len(lamps), 2)

@@ -1,4 +1,4 @@
-"""Objects of several materials: which particles are of which part, and the one material that stands for all."""
+"""Objects of several materials: assign points to parts, and average the parts into one material."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from stages.core.scene.scene import SceneObject
 
 
 def part_of_points(choice: MaterialChoice, x: Float[Tensor, "p 3"]) -> Int[Tensor, "p"]:
-    """Index into `choice.parts` of the part that each point of an object at rest is in [scene units].
+    """Index into `choice.parts` of the part that contains each point of an object at rest [scene units].
 
-    Heights are counted from the lowest point.
+    Heights are relative to the lowest point.
     """
     index = torch.full((len(x),), len(choice.parts) - 1)
     height = x[:, 2] - x[:, 2].min()
@@ -36,7 +36,7 @@ def part_of_points(choice: MaterialChoice, x: Float[Tensor, "p 3"]) -> Int[Tenso
 
 
 def located(choice: MaterialChoice, gaussians: Gaussians, o: SceneObject) -> MaterialChoice:
-    """The choice with its segments among the Gaussians of the object; raises InputError as `Segment.of_object` does."""
+    """The choice with its segments mapped to the object's Gaussians. Raises InputError as `Segment.of_object`."""
     parts = [p if p.segment is None else replace(p, segment=p.segment.of_object(gaussians, o)) for p in choice.several]
     return replace(choice, several=tuple(parts))
 
@@ -47,11 +47,11 @@ def segment_files(choices: Mapping[int, MaterialChoice]) -> list[Path]:
 
 
 def averaged(choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"]) -> MaterialChoice:
-    """The choice with the average of its parts as its material; unchanged where it has one part.
+    """The choice with the average of its parts as its material; unchanged if it has one part.
 
-    Density, Poisson's ratio and loss are means by volume, so that the mass is that of the parts; friction is the mean
-    by mass; Young's modulus is the harmonic mean by volume, that of the parts stacked on each other. A plastic part
-    gives its model to the whole.
+    Density, Poisson's ratio and loss are volume-weighted means, which keeps the total mass; friction is the
+    mass-weighted mean; Young's modulus is the volume-weighted harmonic mean, as for parts stacked on each other. If a
+    part is plastic, the whole has the model of the first such part.
     """
     if len(choice.parts) == 1:
         return choice
@@ -73,9 +73,9 @@ def averaged(choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tens
 def uneven_moments(
     choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"]
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
-    """What the parts' densities add to the centre of mass and to the inertia about it, per unit of mass, of an object.
+    """Change of an object's centre of mass, and of the inertia about it per unit of mass, due to its parts' densities.
 
-    Both are zero for a uniform object.
+    Both are relative to a uniform object of the same shape, and zero if the object is uniform.
     """
     if len(choice.parts) == 1:
         return torch.zeros(3), torch.zeros(3, 3)
@@ -85,7 +85,7 @@ def uneven_moments(
 
 
 def _moments(x: Float[Tensor, "p 3"], mass: Float[Tensor, "p"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
-    """Centre of mass and inertia about it per unit of mass."""
+    """Centre of mass, and inertia about it per unit of mass, of point masses."""
     share = (mass / mass.sum())[:, None]
     com = (share * x).sum(0)
     r = x - com

@@ -1,4 +1,4 @@
-"""Parts of an object by a second segmentation of its scene: the Gaussians of one object of another labelled PLY."""
+"""Parts of an object given by a second segmentation of its scene: an object of another labelled PLY."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class Segment:
 
     path: Path
     name: str
-    means: Float[Tensor, "n 3"]  # of the Gaussians that a point may be nearest to
-    inside: Bool[Tensor, "n"]  # whether a Gaussian is of the segment
+    means: Float[Tensor, "n 3"]  # centres of the Gaussians, in the segment or not
+    inside: Bool[Tensor, "n"]  # whether a Gaussian is in the segment
 
     def contains(self, x: Float[Tensor, "p 3"]) -> Bool[Tensor, "p"]:
-        """Whether the Gaussian nearest to each point is of the segment."""
+        """Whether the Gaussian nearest to each point is in the segment."""
         return self.inside[knn(self.means, x, 1)[1][:, 0]]
 
     def of_object(self, gaussians: Gaussians, o: SceneObject) -> Segment:
-        """The segment among the Gaussians of an object of the scene, each taken as its nearest in the PLY.
+        """The segment restricted to the Gaussians of an object of the scene, each labelled as its nearest in the PLY.
 
-        Points inside the object are then never nearest to a Gaussian of what it touches. Raises InputError if nothing
-        of the object is in the segment.
+        A point in the object is then never assigned to a neighbouring object. Raises InputError if none of the
+        object's Gaussians is in the segment.
         """
         means = gaussians.means[gaussians.object_id == o.id]
         inside = self.contains(means)

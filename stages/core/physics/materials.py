@@ -2,9 +2,10 @@
 
 Handbook values hold for the solid substance; many real objects are hollow, so give measured values where they matter.
 Friction is Coulomb's coefficient against the floor. `loss` is the loss factor tan(delta) of the slowest elastic
-vibration of a whole body: the energy lost per cycle divided by 2 pi times the stored energy. Stiff solids lose far more
-in an impact, by plastic deformation at the contact and waves, than that of their substance: theirs is the factor with
-which half an oscillation leaves the measured share of the speed (restitution).
+vibration of a whole body: the energy lost per cycle divided by 2 pi times the stored energy. In an impact, plastic
+deformation at the contact and waves dissipate far more than the loss factor of a stiff solid's substance accounts for.
+Their `loss` is therefore the value for which half an oscillation leaves the measured fraction of the speed
+(restitution).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class MaterialModel:
     kernel: int  # number of the model in the kernels
     parameters: str  # meaning of Material.plastic
     plastic: bool = False  # whether it yields or flows; the first parameter must then be positive
-    # parameters for the kernels, of a material whose E is reduced by a factor: it yields at the same strain
+    # Material.plastic and the factor by which E is reduced -> kernel parameters with the same yield strain
     solver_parameters: Callable[[Triple, float], Triple] = lambda plastic, factor: plastic
 
 
@@ -71,7 +72,7 @@ GIBSON = "Gibson and Ashby 1997, Cellular Solids, ch. 5"
 PAPER = "GSCollision, E and density as published (Poisson 0.3); friction and loss are ours"
 
 MATERIALS: Mapping[str, Material] = {
-    # rubber: Poisson 0.49 in the handbook; 0.45 keeps pressure waves, and so the substep, affordable
+    # rubber: Poisson's ratio is 0.49 in the handbook; 0.45 limits the speed of pressure waves, which bounds the substep
     "rubber": Material(2e6, 930.0, 0.45, 0.8, 0.15, source=ASHBY + ": natural rubber 1.5-2.5 MPa"),
     "common": Material(1e7, 540.0, 0.3, 0.5, 0.4, source="a guess: keeps its shape as hard rubber or thin plastic, and "
                        "half of the speed of an impact as household objects on a table; "
@@ -122,26 +123,26 @@ ALIASES = {  # material of objects whose name contains one of these words
     "fruit": ["apple", "banana", "orange", "lemon", "pear"],
     "ball": ["soccer", "football", "basketball"],
 }
-MAX_PARTS = 100  # of an object
-REGION = ("below", "box", "segment")  # keys that say where a part is
-DEFAULT_MATERIAL = "common"  # of objects whose name suggests none
+MAX_PARTS = 100  # most parts of an object
+REGION = ("below", "box", "segment")  # keys that give the region of a part
+DEFAULT_MATERIAL = "common"  # for objects whose name suggests no material
 
 
 @dataclass(frozen=True)
 class MaterialPart:
-    """A part of an object and its material; what is in several parts is of the first of them."""
+    """A part of an object and its material. Where parts overlap, the first one applies."""
 
     name: str
     material: Material
-    below: float | None = None  # height above the object's lowest point [scene units]
-    box: tuple[float, ...] | None = None  # lower and upper corner, in the scene at rest [scene units]
+    below: float | None = None  # the part is below this height above the object's lowest point [scene units]
+    box: tuple[float, ...] | None = None  # lower and upper corner, in scene coordinates at rest [scene units]
     pinned: bool = False  # held at its position
     segment: Segment | None = None  # an object of another labelling of the scene
 
 
 @dataclass(frozen=True)
 class MaterialChoice:
-    """The material of an object: of all its parts, or one that stands for them (see material_parts.py)."""
+    """The material of an object: that of all its parts, or one that represents them (see material_parts.py)."""
 
     name: str
     material: Material
@@ -150,7 +151,7 @@ class MaterialChoice:
 
     @property
     def parts(self) -> tuple[MaterialPart, ...]:
-        """The parts, one where the object is uniform."""
+        """The parts of the object; a single one if it is uniform."""
         return self.several or (MaterialPart(self.name, self.material),)
 
 
@@ -198,18 +199,18 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
 
 
 def check_new(o: SceneObject, given: Collection[int], where: str) -> None:
-    """InputError if an option, which `where` begins with, was given for this object before."""
+    """Raise InputError, prefixed with `where`, if the option was already given for this object."""
     if o.id in given:
         raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one")
 
 
 def _by_name(o: SceneObject) -> MaterialChoice:
-    """The scene's material of an object, or the one that its name suggests."""
+    """The material that the scene gives for an object, or the one that its name suggests."""
     if o.material:
         return _material(o.material, f"object {o.id} ({quote(o.name)}) of the scene")
     words = set(re.findall(r"[a-z]+(?:-[a-z]+)?", o.name.lower()))
     words |= {word.removesuffix("s") for word in words}
-    # objects of the paper before substances: a "rubber duck" is a duck
+    # the paper's objects take precedence over substances: a "rubber duck" is a duck
     for name in sorted(words & MATERIALS.keys(), key=lambda name: not MATERIALS[name].source.startswith(PAPER)):
         return MaterialChoice(name, MATERIALS[name])
     for name, others in ALIASES.items():
@@ -219,7 +220,7 @@ def _by_name(o: SceneObject) -> MaterialChoice:
 
 
 def _material(value: object, where: str) -> MaterialChoice:
-    """A material by name, or one of a dict of values, checked."""
+    """A material by name or from a dict of values; InputError for an unknown name or a value out of range."""
     if isinstance(value, str):
         if value.lower() not in MATERIALS:
             raise InputError(f"{where}: no material called {quote(repr(value))}; choose from {', '.join(MATERIALS)}")
@@ -281,7 +282,7 @@ def _parts(value: dict, where: str, folder: Path) -> MaterialChoice:
 
 
 def _segment(row: dict, where: str, folder: Path) -> Segment | None:
-    """The segment of a part, if it has one; ValueError or InputError for a wrong one."""
+    """The segment of a part, if it has one. Raises ValueError or InputError for a malformed or unknown one."""
     if ("segment" in row) != ("in" in row):
         raise ValueError("segment (a name or id) and in (the labelled PLY that has it) belong together")
     if "segment" not in row:

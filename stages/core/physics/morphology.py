@@ -1,6 +1,6 @@
-"""Morphology of voxel masks by shifted copies: as scipy.ndimage, several times as fast for small neighbourhoods.
+"""Morphological operations on voxel masks by shifted copies: several times as fast as scipy.ndimage for small radii.
 
-Voxels beyond the grid are empty, except where distances are measured.
+Voxels outside the grid count as empty, except that distances are measured within the grid.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def _along(array: np.ndarray, axis: int) -> np.ndarray:
 
 
 def dilated(mask: Mask, iterations: int = 1) -> Mask:
-    """The mask with the voxels that share a face with one of it, repeatedly."""
+    """The mask dilated by the 6-neighbourhood (voxels that share a face), repeatedly."""
     for _ in range(iterations):
         before, mask = mask, mask.copy()
         for axis in range(3):
@@ -28,7 +28,7 @@ def dilated(mask: Mask, iterations: int = 1) -> Mask:
 
 
 def eroded(mask: Mask, iterations: int = 1) -> Mask:
-    """The mask without the voxels that share a face with one outside of it, repeatedly."""
+    """The mask eroded by the 6-neighbourhood (voxels that share a face), repeatedly."""
     for _ in range(iterations):
         before, mask = mask, mask.copy()
         for axis in range(3):
@@ -40,7 +40,7 @@ def eroded(mask: Mask, iterations: int = 1) -> Mask:
 
 
 def surrounded(mask: Mask, iterations: int = 1) -> Mask:
-    """The mask with the voxels that share a face, an edge or a corner with one of it, repeatedly."""
+    """The mask dilated by the 26-neighbourhood (voxels that share a face, an edge or a corner), repeatedly."""
     for _ in range(iterations):
         for axis in range(3):
             given = _along(mask, axis)
@@ -52,7 +52,7 @@ def surrounded(mask: Mask, iterations: int = 1) -> Mask:
 
 
 def opened(mask: Mask) -> Mask:
-    """The union of the cubes of 2 x 2 x 2 voxels within the mask."""
+    """Opening of the mask by a cube: the union of all cubes of 2 x 2 x 2 voxels inside it."""
     for axis in range(3):
         given = _along(mask, axis)
         mask = np.moveaxis(given[1:] & given[:-1], 0, axis)
@@ -66,7 +66,7 @@ def opened(mask: Mask) -> Mask:
 
 
 def squared_distances(mask: Mask, most: int) -> UInt[np.ndarray, "x y z"]:
-    """Squared distances to the nearest voxel of the mask [voxels^2], exact up to `most`^2 and most^2 + 1 beyond."""
+    """Squared distances to the nearest voxel of the mask [voxels^2]: exact up to most^2, and most^2 + 1 beyond."""
     beyond = most**2 + 1
     squared = np.where(mask, 0, beyond).astype(np.min_scalar_type(2 * beyond))
     for axis in range(3):
@@ -80,5 +80,5 @@ def squared_distances(mask: Mask, most: int) -> UInt[np.ndarray, "x y z"]:
 
 
 def within(mask: Mask, radius: int) -> Mask:
-    """The voxels whose centre is within this distance [voxels] of that of one of the mask."""
+    """The mask dilated by a ball of this radius [voxels], between voxel centres."""
     return squared_distances(mask, radius) <= radius**2

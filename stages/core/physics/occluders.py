@@ -1,4 +1,4 @@
-"""Spheres that approximate the objects in the computation of shadows; they move with the keypoints as Gaussians do."""
+"""Spheres that approximate the objects for shadows; they move with the keypoints as Gaussians do."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints
 
 log = logging.getLogger(__name__)
-PARTICLES = 4000  # of all objects, from which the spheres are made
-SPHERES = 8  # for each object
-MAX_SPHERES = 480  # for all objects
+PARTICLES = 4000  # particles of all objects together, which are clustered into spheres
+SPHERES = 8  # per object
+MAX_SPHERES = 480  # of all objects together
 LLOYD_STEPS = 8
-_VIEWS = torch.nn.functional.normalize(  # axes, face and space diagonals of a cube
+_VIEWS = torch.nn.functional.normalize(  # axes, face diagonals and space diagonals of a cube
     torch.tensor([view for view in product((1.0, 0.0, -1.0), repeat=3) if view > (0.0, 0.0, 0.0)])
 )
 
 
 class Occluders:
-    """The spheres at rest, with their binding to keypoints; those of frames are on `device`."""
+    """The spheres at rest, bound to keypoints; the spheres of frames are on `device`."""
 
     def __init__(self, rest: Spheres, keypoints: Keypoints, device: str = "cpu"):
         self.binding = _bind(rest, keypoints)
@@ -47,7 +47,7 @@ class Occluders:
     def moved(self, positions: Float[Tensor, "p 3"], fade: bool = False) -> Spheres:
         """The spheres for these keypoint positions [scene units].
 
-        With `fade` an object blocks nothing at rest, and more the farther it moved, up to its radius.
+        With `fade` an object blocks no light at rest, and its full share once it has moved by its radius.
         """
         centres, weights = self._skinning(positions).means, self.rest.weights
         if fade:
@@ -66,7 +66,7 @@ class Occluders:
 
 
 def make_occluders(scene: Scene, keypoints: Keypoints, device: str = "cpu") -> Occluders | None:
-    """Spheres of the objects that have keypoints; None where there are none, or where their bodies are unusable."""
+    """Spheres of the objects that have keypoints; None if there are no such objects, or an object cannot be sampled."""
     moving = [o for o in scene.objects if bool((keypoints.object_id == o.id).any())]
     count = min(SPHERES, MAX_SPHERES // max(len(moving), 1))
     if not count or not moving:
@@ -86,7 +86,7 @@ def make_occluders(scene: Scene, keypoints: Keypoints, device: str = "cpu") -> O
 
 
 def _spheres(x: Tensor, volume: Tensor, spacing: float, count: int, id: int) -> Spheres:
-    """Clusters of the particles by Lloyd's algorithm, each as the sphere of equal volume."""
+    """Cluster the particles of an object by Lloyd's algorithm; each cluster gives the sphere of equal volume."""
     centres = x[farthest_points(x, count)]
     for _ in range(LLOYD_STEPS):
         nearest = torch.cdist(x, centres).argmin(1)
@@ -102,7 +102,7 @@ def _spheres(x: Tensor, volume: Tensor, spacing: float, count: int, id: int) -> 
 
 
 def _projected_area(x: Tensor, spacing: float) -> float:
-    """Area of the outline of a body of voxels [square scene units], the mean of several views."""
+    """Projected area of a body of voxels of edge `spacing` [square scene units], averaged over several views."""
     areas = []
     for view in _VIEWS:
         a = torch.nn.functional.normalize(torch.linalg.cross(view, torch.tensor([0.12, 0.52, -0.7])), dim=0)
@@ -112,7 +112,7 @@ def _projected_area(x: Tensor, spacing: float) -> float:
 
 
 def _bind(spheres: Spheres, keypoints: Keypoints) -> Binding:
-    """Each sphere follows the nearest keypoints of its object."""
+    """Bind each sphere to the nearest keypoints of its object."""
     m = len(spheres.radii)
     index, weight = torch.full((m, KEYPOINTS_PER_GAUSSIAN), -1), torch.zeros(m, KEYPOINTS_PER_GAUSSIAN)
     for id in spheres.object_id.unique():

@@ -43,13 +43,13 @@ log = logging.getLogger(__name__)
 MIN_PARTICLE_OPACITY = 0.02  # Gaussians of lower opacity are ignored, as published
 MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
-START = 0.25  # of the object's bounds in their voxel
-CLOSED = 1.5  # gap between Gaussians that is closed [their spacing]: the diagonal of a square of four is 1.41
-AROUND = 4  # neighbours at the same distance in a square lattice
-MEDIAN_AROUND = gammaincinv(AROUND, 0.5)  # of pi density distance^2 to the fourth neighbour at random
-RANDOM = (math.log(2) / MEDIAN_AROUND) ** 0.5  # ratio of the median distances to the first and the fourth at random
-ON_FLOOR = 4  # gap up to which it stands on the floor [voxels]
-BASE = 0.1  # fraction of a body's voxels that are below the top of its base, or ON_FLOOR voxels more
+START = 0.25  # position of the object's lower bounds within the first voxel [voxels]
+CLOSED = 1.5  # largest gap between evenly spaced Gaussians [their spacing]: the diagonal of a square of four is 1.41
+AROUND = 4  # number of neighbours at equal distance in a square lattice
+MEDIAN_AROUND = gammaincinv(AROUND, 0.5)  # median of pi density distance^2 to the fourth neighbour, Poisson process
+RANDOM = (math.log(2) / MEDIAN_AROUND) ** 0.5  # ratio of median distances to the first and fourth neighbour, likewise
+ON_FLOOR = 4  # gap up to which an object stands on the floor [voxels]
+BASE = 0.1  # a body's base reaches up to ON_FLOOR voxels above this quantile of its voxels' heights
 
 
 @dataclass(frozen=True)
@@ -59,22 +59,21 @@ class Bodies:
     x: Float[Tensor, "p 3"]
     body: Int[Tensor, "p"]  # index into scene.objects
     volume: Float[Tensor, "p"]
-    spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
+    spacing: float  # edge of a voxel; without `skin`, particles of thick bodies stay this far inside the surface
 
 
 @cached_in_scene
 def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -> Bodies:
     """Sample about `count` particles for all objects together, in bounded time and memory.
 
-    With `skin` the outermost layer of voxels of thick bodies has particles too.
-
-    Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
-    Raises InputError for an object without any usable Gaussian.
+    With `skin` the outermost layer of voxels of thick bodies also has particles. Objects that stood on the floor when
+    photographed but would tip over as reconstructed are extended down to the floor. Raises InputError for an object
+    without any usable Gaussian.
     """
     found = parallel_map(lambda o: _cloud(scene, o.id, seed), scene.objects)
     clouds = [SurfaceCloud(*row, _others(scene, o.id)) for row, o in zip(found, scene.objects, strict=True)]
     extent = max(float((c.points.max(0) - c.points.min(0)).max()) for c in clouds)
-    # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
+    # closing bridges up to eight voxels, so smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(c.hole for c in clouds) / 8, 1e-4 * scene_size(scene), 1e-9)
     h, ratio = max(extent / 40, finest), 1.0
     for _ in range(5):
@@ -130,7 +129,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     Raises InputError for an object without any usable Gaussian.
     """
     good = _usable(scene, object_id)
-    if not len(good):  # fall back to the bare centres
+    if not len(good):  # use the centres of all its Gaussians that are finite
         mine = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu()
         means = mine[mine.isfinite().all(1)]
         if not len(means):
@@ -145,7 +144,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     gap = _spacing(means) or size / 50
     scales = good.scales.double().clamp(max=max(size / 6, 1e-9) if len(good) > 1 else float(good.scales.median()))
     area = scales.sort(1).values[:, 1:].prod(1) * 4 / max(gap, 1e-12) ** 2
-    each = (area.clamp(1, 32) - 1e-3).ceil().long()  # at a whole number rounding must not decide
+    each = (area.clamp(1, 32) - 1e-3).ceil().long()  # the offset keeps rounding errors from changing whole numbers
     each = (each * min(1.0, MAX_SURFACE_SAMPLES / float(each.sum()))).long().clamp_min(1)
     rng = torch.Generator().manual_seed(seed)
     of = torch.arange(len(good)).repeat_interleave(each)
@@ -156,7 +155,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
 
 
 def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
-    """Mask of points whose distance to the median centre is not an outlier (robust z-score)."""
+    """Mask of the points whose distance from the median centre is no outlier (robust z-score)."""
     distance = (points - points.median(0).values).norm(dim=1)
     middle = distance.median()
     spread = (distance - middle).abs().median()
@@ -165,11 +164,11 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
 
 @cached_in_scene
 def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tuple[Float[Tensor, "m 3"], float]:
-    """Centres of the voxels of an object's filled body, its skin included, and their edge.
+    """Centres of the voxels of an object's filled body, including its outermost layer, and their edge length.
 
-    There are about `along` voxels along its longest side, fewer where its surface is sampled too coarsely. The object's
-    lower bounds are within the first ones, so that rounding does not decide in which voxels flat sides are. Raises
-    InputError for an object without any usable Gaussian.
+    There are about `along` voxels along its longest side, fewer if its surface is sampled too coarsely. The object's
+    lower bounds lie inside the first voxels, not on their faces, so that rounding does not decide which voxels contain
+    a flat side. Raises InputError for an object without any usable Gaussian.
     """
     points, gap, hole = _cloud(scene, object_id, seed)
     spacing = _usable_spacing(scene, object_id)
@@ -183,9 +182,10 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
 
 
 def _solid(scene: Scene, cloud: SurfaceCloud, h: float, skin: bool) -> tuple[np.ndarray, float, bool]:
-    """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
-    of volume that each represents; and whether it was extended down to the floor, as one that would tip over although
-    it stood when photographed.
+    """Voxelise an object with voxels of edge h.
+
+    Returns the indices (m, 3) of the voxels that get a particle, the volume that each represents [voxels], and whether
+    the body was extended down to the floor because it stood there when photographed but would tip over.
     """
     stands = _stands(cloud.points, h, scene.floor)
     body, low = closed_body(cloud, h, scene.floor if stands else None)
@@ -202,7 +202,10 @@ def _solid(scene: Scene, cloud: SurfaceCloud, h: float, skin: bool) -> tuple[np.
 
 
 def _others(scene: Scene, object_id: int, origin: np.ndarray | float = 0.0) -> np.ndarray | None:
-    """Centres (k, 3) of the Gaussians of the other objects of a scene whose unseen sides are missing, from `origin`."""
+    """Centres (k, 3) of the other objects' Gaussians relative to `origin`, or None if no unseen sides are missing.
+
+    Unseen sides are missing in scenes with cameras that `ngff refine` has not processed.
+    """
     if scene.cameras is None or "refine" in scene.commands:
         return None
     means = [usable_means(scene, o.id) for o in scene.objects if o.id != object_id]
@@ -210,7 +213,7 @@ def _others(scene: Scene, object_id: int, origin: np.ndarray | float = 0.0) -> n
 
 
 def _stands(points: np.ndarray, h: float, floor: float | None) -> bool:
-    """Whether an object with these points, without stray ones, ends within ON_FLOOR voxels of edge h of the floor."""
+    """Whether an object's lowest point, apart from stray ones, is within ON_FLOOR voxels of edge h of the floor."""
     return floor is not None and abs(float(np.quantile(points[:, 2], STRAY)) - floor) < ON_FLOOR * h
 
 
@@ -222,7 +225,7 @@ def _topples(body: np.ndarray) -> bool:
 
 @cached_in_scene
 def _cloud(scene: Scene, object_id: int, seed: int) -> tuple[np.ndarray, float, float]:
-    """`surface_points` of an object, the gap between them, and the widest one that a closed surface has."""
+    """`surface_points` of an object, the usual gap between them, and the widest gap within a closed surface."""
     points = surface_points(scene, object_id, seed)
     gap = max(_gap(points), CLOSED * _usable_spacing(scene, object_id))
     return points, gap, max(gap, largest_hole(usable_means(scene, object_id).double()))
@@ -235,7 +238,7 @@ def _usable_spacing(scene: Scene, object_id: int) -> float:
 
 
 def _spacing(means: Float[Tensor, "n 3"], neighbour: int = 1) -> float:
-    """Median distance of Gaussians to the k-th nearest other; 0 where there are not so many."""
+    """Median distance of Gaussians to their k-th nearest neighbour; 0 if there are not enough."""
     if len(means) <= neighbour:
         return 0.0
     some = means[:: max(1, len(means) // 2000)]
@@ -244,15 +247,15 @@ def _spacing(means: Float[Tensor, "n 3"], neighbour: int = 1) -> float:
 
 
 def largest_hole(means: Float[Tensor, "n 3"]) -> float:
-    """Width of the largest hole between Gaussians that lie evenly or at random on a closed surface.
+    """Expected width of the largest hole between Gaussians spread evenly or at random over a closed surface.
 
-    Holes between points at random are much wider than those of a lattice with as many, and some are found on any
-    surface: of the 2 n circles through three of n points that have no other inside, a share (1 + x) exp(-x) is larger
-    than x / pi of the area per point (Miles 1970, "On the homogeneous planar Poisson point process"). Between a lattice
-    and this, widths are interpolated by the ratio of the distances to the nearest and the fourth neighbour.
+    Random points leave much wider holes than a lattice of equal density: of the 2 n circles through three of n points
+    with no other point inside, the fraction (1 + x) exp(-x) is larger than x / pi times the area per point (Miles 1970,
+    "On the homogeneous planar Poisson point process"). The width is interpolated between that of a lattice and that of
+    random points by the ratio of the median distances to the nearest and the fourth neighbour.
     """
     near, around = _spacing(means), _spacing(means, AROUND)
-    if not around:  # few, or more than AROUND in one place
+    if not around:  # too few points, or more than AROUND in one place
         return CLOSED * near
     even = np.clip((near / around - RANDOM) / (1 - RANDOM), 0.0, 1.0)
     at_random = 2 * math.sqrt(float(gammainccinv(2, 0.5 / len(means))) / MEDIAN_AROUND)
@@ -260,14 +263,14 @@ def largest_hole(means: Float[Tensor, "n 3"]) -> float:
 
 
 def _gap(points: np.ndarray) -> float:
-    """Gap that closing must bridge: the 90 % quantile of the distance to the third neighbour."""
+    """Gap that closing must bridge: the 90 % quantile of the distance to the third-nearest neighbour."""
     some = torch.from_numpy(points)
     distance, _ = knn(some, some[:: max(1, len(some) // 1000)], 4)
     return float(distance[:, 3].quantile(0.9))
 
 
 def _without_overlap(bodies: list[np.ndarray]) -> list[np.ndarray]:
-    """Assign each voxel to one body, smaller bodies first, unless too few voxels would remain."""
+    """Assign each voxel to one body, smaller bodies first; a body that would keep too few voxels keeps all of them."""
     out, low = list(bodies), np.min([b.min(0) for b in bodies], axis=0)
     span = np.max([b.max(0) for b in bodies], axis=0) - low + 1
     order = sorted(range(len(bodies)), key=lambda i: len(bodies[i]))

@@ -1,4 +1,4 @@
-"""What acted in a simulation with the options that repeat it: of a trajectory, or saved by a page that simulates."""
+"""Read the prompts and options that repeat a simulation, from a trajectory or a file that a playable page saved."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.schema import flag, number, reason, rows, table, text, texts, whole
 
-# Options of `ngff simulate` that --forces repeats -> checks of their values; not those that name other files.
+# Options of `ngff simulate` that --forces repeats, and checks of their values; without options that name other files.
 OPTIONS: dict[str, Callable] = {
     "dt": number, "engine": text, "gravity": number, "quality": text, "material": texts, "floor": number,
     "friction": number, "box": text, "keypoints": whole, "integrator": text, "contact": text, "rest": flag,
@@ -33,7 +33,7 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording | None:
-    """The recording in a trajectory or a JSON file {options, frames, prompts}; None for JSON in the format of NGFF.
+    """Read the recording of a trajectory or a JSON file {options, frames, prompts}; None for JSON in NGFF's format.
 
     Raises InputError for damaged files.
     """
@@ -55,7 +55,7 @@ def read_recording(path: Path) -> Recording | None:
 
 
 def read_prompts_file(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> ForcePrompts:
-    """The prompts of a recording, or of JSON in the format of NGFF (`read_forces`).
+    """Read the prompts of a recording, or of JSON in the format of NGFF (`read_forces`).
 
     Raises InputError for damaged files, and for objects that are not in this scene.
     """

@@ -1,7 +1,7 @@
-"""Each object as a rigid body: its convex hull, and the volume, centre of mass and inertia of what it fills.
+"""Rigid-body shape of each object: its convex hull, volume, centre of mass and inertia.
 
-A round object is a ball (`ball_fit.py`) or a cylinder (`cylinder_fit.py`). Of the others, one that fills its convex
-hull has the moments of that, the rest have those of their filled voxels. Lengths are in the unit of the Gaussians.
+Round objects are balls (`ball_fit.py`) or cylinders (`cylinder_fit.py`). Any other object that fills its convex hull
+has the moments of the hull; the rest have those of their filled voxels. Lengths are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
-MAX_VERTICES = 200  # of a hull: an egg is round to 1 %
-THIN = 4.0  # mean thickness of a hull up to which the volume of voxels does not tell that it is filled [voxels]
-COVERED = 1.5  # distance from a voxel of the body up to which the surface of a thin hull is covered [voxels]
-COVER = 0.98  # share of its surface that is
-HULL_SUBSET = 2000  # points of which the hull tells that an object does not fill that of all
+CONVEX = 0.9  # least fraction of its hull that a convex object fills; volumes of voxels are accurate to about 5 %
+MAX_VERTICES = 200  # of a hull: approximates an egg to 1 %
+THIN = 4.0  # mean hull thickness below which the volume of voxels is too inaccurate for CONVEX [voxels]
+COVERED = 1.5  # distance from the nearest voxel of the body up to which a point on a thin hull is covered [voxels]
+COVER = 0.98  # least fraction of the surface of a thin hull that is covered if the object fills it
+HULL_SUBSET = 2000  # points whose hull is tested first: an object that does not fill it fills no larger hull
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
 
@@ -39,29 +39,29 @@ class Solid:
 
     voxels: np.ndarray  # (m, 3), centres
     h: float  # edge of a voxel
-    surface: np.ndarray  # (n, 3), points on it
-    seen: np.ndarray  # (k, 3), centres of its Gaussians
+    surface: np.ndarray  # (n, 3), points on the surface
+    seen: np.ndarray  # (k, 3), centres of the object's Gaussians
     moments: Moments
 
 
 @dataclass(frozen=True)
 class RigidShape:
-    """Convex hull of an object and the properties of its filled body at density 1."""
+    """Convex hull of an object and the mass properties of its filled body at density 1."""
 
     hull: Float[Tensor, "v 3"]  # vertices
     convex: bool  # the object fills its hull
     volume: float
-    com: Float[Tensor, "3"]
+    com: Float[Tensor, "3"]  # centre of mass
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
-    ball: Ball | None = None  # that a round object is; `hull` has its points in EXTREMES
-    cylinder: Cylinder | None = None  # that it is; `hull` has points of its edges
+    ball: Ball | None = None  # if the object is a ball; `hull` then has the ball's points in the directions EXTREMES
+    cylinder: Cylinder | None = None  # if the object is a cylinder; `hull` then has points on its two rims
 
 
 @cached_in_scene
 def rigid_shapes(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[RigidShape]:
     """The shape of each object, in the order of scene.objects.
 
-    What lies below the height `bottom` is cut off. Raises InputError for an object without any usable Gaussian.
+    The part below the height `bottom` is cut off. Raises InputError for an object without any usable Gaussian.
     """
     solids, found = _solids(scene, seed, bottom), balls(scene, seed, bottom)
 
@@ -74,9 +74,10 @@ def rigid_shapes(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[R
 
 @cached_in_scene
 def standing_shapes(scene: Scene, seed: int, floor: float) -> list[tuple[RigidShape, float]]:
-    """The shape of each object above what it stands on, as `rigid_shapes`, and the height of that.
+    """The shape of each object above its support, as `rigid_shapes`, and the height of the support.
 
-    It is the floor, except for an object of which more than half is below: that stands on something else.
+    The support is at `floor`, except for an object whose median height is below: that stands on something else, and
+    its support is at its lowest point.
     """
     out = [(shape, floor) for shape in rigid_shapes(scene, seed, floor)]
     for row, o in enumerate(scene.objects):
@@ -89,7 +90,7 @@ def standing_shapes(scene: Scene, seed: int, floor: float) -> list[tuple[RigidSh
 
 @cached_in_scene
 def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | None]:
-    """The balls among the objects, in the order of scene.objects; arguments and errors as those of `rigid_shapes`."""
+    """The ball that each object is, or None, in the order of scene.objects; arguments and errors as `rigid_shapes`."""
     solids = _solids(scene, seed, bottom)
 
     def fitted(row: int) -> Ball | None:
@@ -102,9 +103,10 @@ def balls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[Ball | N
 
 @cached_in_scene
 def convex_hulls(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexHull | None]:
-    """The hulls of the objects that fill them, in the order of scene.objects; arguments as of `rigid_shapes`.
+    """The convex hull of each object that fills it, else None, in the order of scene.objects.
 
-    Of the points in EXTREMES: hulls of all points of round objects have a face for every few Gaussians.
+    Arguments and errors as `rigid_shapes`. Only the extreme points in the directions EXTREMES are used, because the
+    hull of all points of a round object has a face for every few Gaussians.
     """
     return [_filled_hull(solid, _extreme(solid.seen)) for solid in _solids(scene, seed, bottom)]
 
@@ -126,8 +128,9 @@ def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
 
 
 def _around(solids: list[Solid], row: int, margin: float) -> np.ndarray:
-    """Centres (n, 3) of the voxels of the other solids up to a margin outside the bounds of one of them, and not in or
-    next to it.
+    """Centres (n, 3) of the other solids' voxels within `margin` of the bounding box of solid `row`.
+
+    Voxels in the solid or next to it are left out.
     """
     own = solids[row]
     low, high = own.voxels.min(0) - margin, own.voxels.max(0) + margin
@@ -160,11 +163,11 @@ def _shape(solid: Solid, seed: int) -> RigidShape:
 
 
 def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
-    """The convex hull of its points, if it fills that."""
+    """The convex hull of `points`, if the solid fills it."""
     for some in (
         points[:: -(-len(points) // HULL_SUBSET)],
         points,
-    ):  # the hull of some is smaller, and found in no time
+    ):  # the hull of a subset is smaller and cheap to compute
         hull = _hull(some)
         if hull is None or (hull.volume * CONVEX >= solid.moments[0] and not _covers(solid, hull)):
             return None
@@ -172,7 +175,7 @@ def _filled_hull(solid: Solid, points: np.ndarray) -> ConvexHull | None:
 
 
 def _covers(solid: Solid, hull: ConvexHull) -> bool:
-    """Whether a body is all over the surface of a hull as thin as a few voxels, and so fills it."""
+    """Whether the hull is only a few voxels thick and the body's voxels cover its surface, so that they fill it."""
     if 2 * hull.volume > THIN * solid.h * hull.area:
         return False
     corners = hull.points[hull.simplices]
@@ -185,7 +188,7 @@ def _covers(solid: Solid, hull: ConvexHull) -> bool:
 
 
 def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:
-    """Those of voxels (m, 3) of edge h of which a share (m,) is filled."""
+    """Moments of voxels with centres (m, 3) and edge h, of each of which the fraction `share` (m,) is filled."""
     x, w = torch.from_numpy(voxels), torch.from_numpy(share / share.sum())
     com = w @ x
     r = x - com
@@ -209,7 +212,7 @@ def _vertices(hull: ConvexHull, seed: int) -> Float[Tensor, "v 3"]:
 
 
 def _solid_moments(hull: ConvexHull) -> Moments:
-    """Volume, centre of mass and inertia about it of a hull, by the tetrahedra from its middle to its triangles."""
+    """Moments of a convex hull, summed over the tetrahedra between an inner point and its triangles."""
     middle = hull.points[hull.vertices].mean(0)
     t = hull.points[hull.simplices] - middle  # (m, 3, 3): corners of each triangle
     volume = np.abs(np.linalg.det(t)) / 6
@@ -224,7 +227,7 @@ def _solid_moments(hull: ConvexHull) -> Moments:
 
 
 def _extreme(points: np.ndarray) -> np.ndarray:
-    """The points that are extreme in one of EXTREMES."""
+    """The points that are extreme in one of the directions EXTREMES."""
     return points[extreme_rows(points)] if len(points) > len(EXTREMES) else points
 
 

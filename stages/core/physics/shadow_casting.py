@@ -1,4 +1,4 @@
-"""The shadows of a trajectory: light and spheres of the objects, found once, and the shaded Gaussians of a frame."""
+"""Shadows in the frames of a trajectory: find light and occluders once, then shade the Gaussians of each frame."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from stages.core.scene.trajectory import Keypoints
 
 @dataclass(frozen=True)
 class ShadowCaster:
-    """Shades Gaussians by objects that are no longer where the photos show them."""
+    """Shades Gaussians by the objects that have moved from where the photos show them."""
 
     light: Light
     occluders: Occluders
 
     def rest_irradiance(self, rest: Gaussians) -> Float[Tensor, "n"]:
-        """The irradiance that the colours of the Gaussians at rest hold."""
+        """Irradiance that is baked into the colours of the Gaussians at rest."""
         if not self.light.in_colours:
             return torch.ones_like(rest.opacities)
         return irradiance(rest.means, rest.object_id, self.occluders.rest, self.light)
 
     def shade(self, g: Gaussians, positions: Float[Tensor, "p 3"], at_rest: Float[Tensor, "n"]) -> Gaussians:
-        """The Gaussians of a frame with these keypoint positions; `at_rest` is what `rest_irradiance` gives."""
+        """Shade the Gaussians of a frame for these keypoint positions; `at_rest` is the result of `rest_irradiance`."""
         spheres = self.occluders.moved(positions, fade=not self.light.in_colours)
         if bool((spheres.centres == self.occluders.rest.centres).all()):
             return g
@@ -43,7 +43,7 @@ def find_shadows(
 ) -> ShadowCaster | None:
     """Light and occluders of a scene at rest, for frames on `device`; None without objects that move.
 
-    Where the background is not that of the photos, its colours hold no shadows.
+    With `other_background` the background is not the one of the photos, so its colours contain no shadows.
     """
     occluders = make_occluders(scene, keypoints, device)
     if occluders is None:

@@ -1,9 +1,9 @@
-"""Signed distance to the surface of a body on a grid, from points on its surface and particles inside it.
+"""Signed distance to the surface of a body on a grid, from points on the surface.
 
-The surface is represented by surfels: discs through the points, normal to the least-varying direction of their
-neighbourhood. A disc faces the side from which rays escape; one with two open sides is a part of a sheet. Holes in the
-surface let only few rays pass. The distance of a grid node is a moving average of the distances to the nearest discs
-that face the same way, so flat faces stay flat and edges sharp.
+The surface is represented by surfels: discs through the points, normal to the direction of least variance of their
+neighbourhood. The outward side of a disc is the one from which more rays escape; a disc with two open sides is part of
+a sheet. Few rays pass through holes in the surface, so small holes do not open a side. The distance of a grid node is a
+weighted mean of the distances to the nearest discs that face the same way, so flat faces stay flat and edges sharp.
 Sources: Pfister et al. 2000, "Surfels"; Kolluri 2008, "Provably good moving least squares" (implicit form).
 """
 
@@ -21,19 +21,19 @@ from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 from stages.core.geometry.symmetric_matrices import eigh
 
 RESOLUTION = 36  # nodes of the grid along each axis
-MARGIN = 4  # cells of the grid around the body
+MARGIN = 4  # width of the grid around the body [cells]
 NORMAL_NEIGHBOURS = 12  # surface points that determine a normal
-BLENDED = 6  # discs whose distances are averaged
-MAX_SURFELS = 6_000  # surface points used; more make no difference at this resolution
-SAME_FACE = 0.5  # smallest cosine of the angle between the normals of discs that are averaged
-OVERLAP = 2.0  # discs are extended by this factor, so that they cover random points without holes
-SURFACE = 0.75  # a node this close to a disc stops rays [cells]
-PROBE = 1.5  # distance from a disc at which the rays of a side start [cells]
-FAR = 2.0  # distance from the surface at which the rays from a node decide on its side [cells]
-FLAT = 1e-6  # height above a disc, relative to the distance from it, up to which a node is in its plane
-MIN_DIFFERENCE = 1e-6  # of the openness of the sides of a disc, of which the more open one is outside
-OPEN = 0.06  # fraction of the rays that escape from an open side, at least
-DIRECTIONS = [d for d in product((-1, 0, 1), repeat=3) if any(d)]  # of the rays, in cells
+BLENDED = 6  # nearest discs whose distances are averaged
+MAX_SURFELS = 6_000  # most surface points used; more make no difference at this resolution
+SAME_FACE = 0.5  # least cosine of the angle between the normals of discs that are averaged
+OVERLAP = 2.0  # factor by which discs are enlarged, so that randomly spaced discs cover the surface without holes
+SURFACE = 0.75  # distance to a disc up to which a node blocks rays [cells]
+PROBE = 1.5  # distance from a disc at which the rays of either side start [cells]
+FAR = 2.0  # distance from the surface above which rays decide whether a node is inside [cells]
+FLAT = 1e-6  # height above a disc, relative to the distance from it, up to which a node lies in its plane
+MIN_DIFFERENCE = 1e-6  # difference of the openness of a disc's two sides below which they are equal
+OPEN = 0.06  # fraction of rays that escape above which a side is open
+DIRECTIONS = [d for d in product((-1, 0, 1), repeat=3) if any(d)]  # of the rays [cells]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class DistanceGrid:
     """Signed distance at the nodes of a grid, negative inside; all lengths in the unit of the points."""
 
     values: Float[Tensor, "g g g"]
-    low: Float[Tensor, "3"]  # the first node
+    low: Float[Tensor, "3"]  # position of the first node
     cell: Float[Tensor, "3"]  # distance between nodes along each axis
 
     def nodes(self) -> Float[Tensor, "g g g 3"]:
@@ -56,7 +56,7 @@ class Surfels:
     centre: Float[Tensor, "m 3"]
     normal: Float[Tensor, "m 3"]  # unit, outward
     radius: Float[Tensor, "m"]
-    half_thickness: Float[Tensor, "m"]  # 0 on the surface of a solid, positive on sheets, which have two sides
+    half_thickness: Float[Tensor, "m"]  # 0 on the surface of a solid; positive on sheets, whose discs are two-sided
 
 
 def distance_grid(points: Float[Tensor, "n 3"], sheet: float, resolution: int = RESOLUTION) -> DistanceGrid:
@@ -74,12 +74,12 @@ def distance_grid(points: Float[Tensor, "n 3"], sheet: float, resolution: int = 
     surfels = _unoriented(x, tree)
     nearest = tree.query(nodes, min(BLENDED, len(x)))
     surface = _on_surface(surfels, nodes, nearest[1], cell).reshape((resolution,) * 3)
-    surface[:, :, MARGIN] = True  # what a body stands on closes it: photos do not show its lower side
+    surface[:, :, MARGIN] = True  # photos do not show the underside of a body, so it is closed at its lowest layer
     openness = _openness(surface)
     surfels = _oriented(surfels, tree, openness, low, cell, sheet)
     side = torch.where(openness.flatten() > OPEN, 1.0, -1.0).to(nodes)
     values = _distance(surfels, nodes, nearest, side)
-    # the side of a single disc can be wrong where walls are thin; away from the surface rays decide
+    # at thin walls a disc can face the wrong side, so away from the surface the rays decide
     values = torch.where(values.abs() > FAR * cell.max(), side * values.abs(), values)
     return DistanceGrid(values.reshape((resolution,) * 3).float(), (low + middle).float(), cell.float())
 
@@ -87,7 +87,8 @@ def distance_grid(points: Float[Tensor, "n 3"], sheet: float, resolution: int = 
 def mass_properties(grid: DistanceGrid) -> tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]:
     """Volume, centre of mass, and inertia tensor about it per unit of mass, of the uniform body inside the surface.
 
-    A node counts by the part of a ball of its cell's size that is inside; second order in the size of a cell.
+    Each node is weighted by the fraction of its cell that is inside, as estimated from its distance. Second-order
+    accurate in the cell size.
     """
     x = grid.nodes().reshape(-1, 3).double()
     width = grid.cell.double().prod() ** (1 / 3)
@@ -100,7 +101,7 @@ def mass_properties(grid: DistanceGrid) -> tuple[float, Float[Tensor, "3"], Floa
 
 
 def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surfels:
-    """Discs at the points, with normals of either sign."""
+    """Discs at the points, with normals of arbitrary sign."""
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     local = points[index] - points[index].mean(1, keepdim=True)
     _, axes = eigh(local.mT @ local)
@@ -122,7 +123,7 @@ def _openness(surface: Bool[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
     """Fraction of the rays from each node that leave the grid without meeting the surface."""
     out = torch.zeros(surface.shape, device=surface.device)
     for direction in DIRECTIONS:
-        hit, reach = _shifted(surface, direction, 1), 1  # by the next `reach` nodes of the ray
+        hit, reach = _shifted(surface, direction, 1), 1  # hit: the surface is among the next `reach` nodes of the ray
         while reach < len(surface):
             hit, reach = hit | _shifted(hit, direction, reach), 2 * reach
         out += ~hit
@@ -142,9 +143,9 @@ def _oriented(
     surfels: Surfels, tree: KDTree | BruteForce, openness: Float[Tensor, "g g g"], low: Tensor, cell: Tensor,
     sheet: float,
 ) -> Surfels:  # fmt: skip
-    """The discs with outward normals, and of thickness `sheet` where both sides are open; neighbours vote.
+    """The discs with outward normals, and with thickness `sheet` where both sides are open.
 
-    The origin is in the middle of the discs.
+    The openness of a side is averaged over neighbouring discs. The origin is in the middle of the discs.
     """
     step = PROBE * (surfels.normal * cell).norm(dim=1, keepdim=True) * surfels.normal
     at = [((x - low) / cell).round().long().clamp(0, len(openness) - 1)
@@ -155,7 +156,7 @@ def _oriented(
     weight = (same.abs() - SAME_FACE).clamp_min(0)
     weight = weight / weight.sum(1, keepdim=True)
     ahead, behind = ((weight * torch.where(same > 0, sides[k][index], sides[1 - k][index])).sum(1) for k in (0, 1))
-    # rounding must not decide between equal sides: then outward is away from the middle
+    # if both sides are equally open, outward is away from the middle, so that rounding does not decide
     equal = (ahead - behind).abs() < MIN_DIFFERENCE
     outward = torch.where(equal, (surfels.normal * surfels.centre).sum(1) > 0, ahead > behind)
     normal = torch.where(outward[:, None], surfels.normal, -surfels.normal)
@@ -169,7 +170,7 @@ def _distance(
 ) -> Float[Tensor, "g"]:  # fmt: skip
     """Signed distance of positions to their nearest discs.
 
-    The sign is that of the mean height above the discs; in their plane, where rounding would decide, that of `side`.
+    The sign is that of the mean height above the discs, or in their plane, where rounding would decide, that of `side`.
     """
     near, index = nearest
     offset, normal = x[:, None] - surfels.centre[index], surfels.normal[index]

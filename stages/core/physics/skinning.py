@@ -1,4 +1,4 @@
-"""Deform Gaussians with their keypoints: displaced, rotated and stretched; at rest they are the input, bit for bit."""
+"""Displace, rotate and stretch Gaussians with their keypoints. At rest the output equals the input bit for bit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Skinning:
     """Linear blend skinning with deformation gradients, prepared once for many frames."""
 
     def __init__(self, gaussians: Gaussians, binding: Binding, keypoints: Keypoints):
-        device = gaussians.means.device  # everything a frame needs; binding and keypoints stay on their own
+        device = gaussians.means.device  # holds everything that a frame needs; the arguments stay on their own devices
         self.gaussians, self._deformation = gaussians, keypoint_deformation(keypoints, device)
         moving = (binding.index >= 0).any(1).nonzero()[:, 0]
         self._binding = Binding(binding.index[moving].int().to(device), binding.weight[moving].float().to(device))
@@ -43,7 +43,10 @@ class Skinning:
 
 
 class KeypointDeformation:
-    """Displacements of keypoints and their gradients; of the last positions known, since several things follow them."""
+    """Displacement and displacement gradient of each keypoint.
+
+    The motion for the last positions is cached, since several sets of Gaussians follow the same keypoints.
+    """
 
     def __init__(self, keypoints: Keypoints, device: torch.device):
         self.rest = keypoints.rest.float().contiguous().to(device)
@@ -56,7 +59,7 @@ class KeypointDeformation:
         self._ridge = RIDGE / 3 * self._M.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-12)
         self._inverse = torch.linalg.inv(self._M.double() + self._ridge * torch.eye(3, device=device)).float()
         _, self._body = keypoints.object_id.to(device).unique(return_inverse=True)
-        self._last: tuple[Tensor, KeypointMotion | None] | None = None  # displacements, and what follows from them
+        self._last: tuple[Tensor, KeypointMotion | None] | None = None  # last displacements and their motion
 
     def of(self, positions: Float[Tensor, "p 3"]) -> KeypointMotion | None:
         """The motion to these positions [scene units]; None where all are at rest."""
@@ -66,16 +69,17 @@ class KeypointDeformation:
         return self._last[1]
 
     def _gradients(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3 3"]:
-        """Displacement gradient at each keypoint: weighted least squares over its neighbours, with a ridge.
+        """Displacement gradient F - I at each keypoint: weighted least squares over its neighbours, with a ridge.
 
         The ridge pulls F towards the best rotation R of the neighbourhood, so that directions in which the neighbours
         have no extent (normal to a sheet, across a rope) rotate with the others:
-            F = (A + r R)(M + r I)^-1,  A = sum a d' d^T,  M = sum a d d^T.
-        A rigid motion is reproduced exactly, since then A = R M. A small weight of the rotation of the whole object
-        determines the rotation about the axis when the neighbours lie on a line.
+            F = (A + r R)(M + r I)^-1,  A = sum a d' d^T,  M = sum a d d^T,
+        where d and d' are the offsets of the neighbours at rest and now. A rigid motion is reproduced exactly, since
+        then A = R M. The rotation of the whole object has a small weight in R, which determines the rotation about the
+        axis if the neighbours lie on a line.
         """
         relative = (u[self._neighbours_of] - u[:, None]).mT @ self._ad  # A - M
-        moved = (relative != 0).flatten(1).any(1).nonzero()[:, 0]  # mostly few: what rests keeps its place exactly
+        moved = (relative != 0).flatten(1).any(1).nonzero()[:, 0]  # mostly few; resting keypoints are exactly at rest
         ridge, relative = self._ridge[moved], relative[moved]
         whole = self._object_rotations(u)[self._body[moved]]
         R = nearest_rotations(self._M[moved] + relative + 0.3 * ridge * whole)
@@ -88,7 +92,7 @@ class KeypointDeformation:
 
 @cached_in_scene
 def keypoint_deformation(keypoints: Keypoints, device: torch.device) -> KeypointDeformation:
-    """Those of keypoints, prepared once for each device."""
+    """The `KeypointDeformation` of keypoints, prepared once for each device."""
     return KeypointDeformation(keypoints, device)
 
 
@@ -104,7 +108,7 @@ def fit_rotations(
     both = rest.double(), positions.double()
     X, x = (p - (torch.zeros(count, 3).to(p).index_add(0, body, p) / size)[body] for p in both)
     H = torch.zeros(count, 3, 3).to(x).index_add(0, body, x[:, :, None] * X[:, None, :])
-    # a small weight of the identity, for points on a line or coincident points
+    # a small multiple of the identity makes the fit unique for collinear and coincident points
     H = H + 1e-6 * (X.square().sum() / max(len(X), 1) + 1e-12) * torch.eye(3).to(H)
     return nearest_rotations(H).to(rest)
 

@@ -1,9 +1,10 @@
-"""The surface of an object's filled body, finer than its voxels.
+"""Signed distance to the surface of an object's filled body, with sub-voxel accuracy.
 
-Samples are the object's Gaussians within a voxel of the surface of the voxels, with normals from the smoothed voxels,
-and faces of voxels where there are none, as at undersides. The signed distance is the mean of those to the tangent
-planes of the nearest samples, where its projection on the nearest one's is near that sample. Source: Hoppe et al. 1992,
-"Surface reconstruction from unorganized points".
+The surface is represented by samples with normals: the object's Gaussians within one voxel of the voxel surface, with
+normals from the gradient of the smoothed occupancy, and voxel faces where there are no Gaussians, as on undersides. The
+signed distance of a point is the mean of its signed distances to the tangent planes of the nearest samples, if its
+projection onto the nearest tangent plane lies close to that sample; elsewhere it is the distance to the voxel surface.
+Source: Hoppe et al. 1992, "Surface reconstruction from unorganized points".
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from stages.core.physics.particles import filled_voxels, inliers, usable_means
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-VOXELS_ALONG = 48  # voxels along a side of a cube
-MIN_SLOPE = 0.12  # of smoothed voxels where the direction out of the body is clear, .4 at the face of a thick one
-SLENDER = 16  # ratio of longest to shortest side beyond which voxels do not get smaller
-MOST_ALONG = 96  # of one that is larger than the others, so that it is as accurate as these where it touches them
-BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
-NEAREST = 8  # samples that give a distance, of which those count
-SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
-NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on the same face count
-MIN_ON_FACE = 6  # samples on the same face by their first normals below which all on the same side are fitted at first
-FITS = 4  # of a plane, with weights that fall with the distance from it
-FLATNESS = 0.1  # distance at which weights fall even if the others are closer [spacing of the samples]
-AT_EDGE = 0.2  # RMS distance of neighbours from the plane of a sample that is at an edge [spacing of the samples]
-FLATTER = 0.5  # ratio of that of a sample beside it, on a face, at most
-ON_PLANE = 0.2  # distance from the plane of that face [spacing of the samples]
-ON_CUT = 0.25  # distance from where a body is cut off up to which a face is taken to be there [voxels]
+VOXELS_ALONG = 48  # number of voxels along the side of a cube-shaped object
+MIN_SLOPE = 0.12  # least occupancy gradient that defines a normal [1/voxel]; .4 at the face of a thick body
+SLENDER = 16  # ratio of longest to shortest side above which voxels get no smaller
+MOST_ALONG = 96  # most voxels along an object larger than the others: its accuracy matches theirs at contacts
+BARE = 3.0  # distance from the nearest Gaussian above which a voxel face is a sample [voxels, at least 1/3 spacing]
+NEAREST = 8  # nearest samples whose tangent planes are averaged for a distance
+SAME_FACE = 0.8  # least cosine between the normals of two samples on the same face
+NEIGHBOURS = 16  # nearest samples to which a tangent plane is fitted
+MIN_ON_FACE = 6  # neighbours of similar normal below which a plane fit starts from all that face the same way
+FITS = 4  # iterations of the reweighted plane fit
+FLATNESS = 0.1  # lower bound of the residual scale in the plane fit's weights [sample spacing]
+AT_EDGE = 0.2  # RMS distance of the neighbours from a sample's plane above which the sample is at an edge [spacing]
+FLATTER = 0.5  # a sample at an edge takes a neighbour's plane whose RMS distance is below this fraction of its own
+ON_PLANE = 0.2  # largest distance of a sample at an edge from the neighbour's plane that it takes [sample spacing]
+ON_CUT = 0.25  # distance from the cut plane up to which samples count as lying on it [voxels]
 OCTANTS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
@@ -43,9 +44,9 @@ class SolidSurface:
     """Voxels, samples and signed distance of an object's body, in scene units."""
 
     def __init__(self, voxels: np.ndarray, h: float, points: np.ndarray):
-        """`voxels` (m, 3) are centres of edge h; `points` (n, 3) are about on the surface."""
+        """`voxels` (m, 3) are the centres of voxels of edge `h`; `points` (n, 3) lie approximately on the surface."""
         self.voxels, self.h, self.seen = voxels, h, points
-        # made at the first use; `cached_property` of Python 3.11 and older would let one thread make them at a time
+        # computed lazily; `cached_property` of Python 3.11 and older has one lock for all instances
         self._fitted: SolidSurface | None = None
         self._fine_grid: np.ndarray | None = None
         self._first = voxels.min(0) - 2 * h  # centre of the first voxel of the grid
@@ -54,7 +55,7 @@ class SolidSurface:
         full[tuple(cells.T)] = True
         self._full = full
         inside, outside = (ndimage.distance_transform_edt(part) - 0.5 for part in (full, ~full))
-        self._depth = h * np.where(full, inside, -outside)  # to the faces of the voxels
+        self._depth = h * np.where(full, inside, -outside)  # below the voxel faces
         near = points[np.abs(self._coarse_depth(points)) <= h]
         smooth = ndimage.gaussian_filter(full.astype(np.float32), 1.0)
         normals = -np.stack([self._at(slope, near) for slope in np.gradient(smooth)], 1)
@@ -70,13 +71,13 @@ class SolidSurface:
         self.points, self.normals = np.concatenate([near, faces]), np.concatenate([normals, outward])
         self._tree = cKDTree(self.points)
         apart = self._tree.query(self.points[:: -(-len(self.points) // 2000)], 2)[0][:, 1]
-        self.spacing = max(h, float(np.median(apart)))  # of samples, within which a tangent plane is known to continue
+        self.spacing = max(h, float(np.median(apart)))  # of the samples; tangent planes are trusted up to this distance
 
     @property
     def fitted(self) -> SolidSurface:
-        """The same with one sample a voxel, on the plane that fits the samples around it on its face.
+        """The surface with one sample per voxel, moved onto a plane fitted to the neighbouring samples on its face.
 
-        By iteratively reweighted least squares, so that the planes of samples at an edge are those of one face.
+        Iteratively reweighted least squares makes the plane of a sample at an edge fit one of the faces.
         """
         if self._fitted is None:
             self._fitted = self._fit()
@@ -84,13 +85,13 @@ class SolidSurface:
 
     def _fit(self) -> SolidSurface:
         out = copy.copy(self)
-        out._fine_grid = None  # of the other samples
+        out._fine_grid = None  # it was computed from the original samples
         chosen = self.thinned()
         points, outward = self.points[chosen], self.normals[chosen]
         distance, row = self._tree.query(points, NEIGHBOURS + 1)
         distance, row = distance[:, :-1] / distance[:, -1:], np.minimum(row[:, :-1], len(self.points) - 1)
         along = (self.normals[row] * outward[:, None]).sum(-1)
-        near = np.where(along > 0, (1 - distance**2).clip(1e-9), 0.0)  # 0 where the set of neighbours changes
+        near = np.where(along > 0, (1 - distance**2).clip(1e-9), 0.0)  # falls to 0 at the first sample left out
         same_face = along > SAME_FACE
         weight = np.where((same_face.sum(1) >= MIN_ON_FACE)[:, None], near * same_face, near)
         around = self.points[row] - points[:, None]
@@ -111,20 +112,20 @@ class SolidSurface:
         return out
 
     def depth(self, x: np.ndarray) -> np.ndarray:
-        """Depths (k,) of points (k, 3) below the surface, negative outside."""
+        """Depth (k,) of points (k, 3) below the surface [scene units], negative outside."""
         out = self._coarse_depth(x)
         close = np.flatnonzero(np.abs(out) < 2 * self.h)
         out[close] = self._fine_depth(x[close], out[close])
         return out
 
     def _fine_depth(self, x: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-        """Depths (k,) of points (k, 3) for which samples are looked up, from their depths in the voxels."""
+        """Depth (k,) of points (k, 3) by tangent planes, or their voxel depth `coarse` (k,) where none applies."""
         out = coarse.copy()
         distance, row = self._tree.query(x, distance_upper_bound=2 * self.h)
         close = np.flatnonzero(distance < np.inf)
         row = row[close]
         height = ((self.points[row] - x[close]) * self.normals[row]).sum(1)
-        beside = distance[close] ** 2 - height**2  # squared distance of its projection to the nearest sample
+        beside = distance[close] ** 2 - height**2  # squared distance of the projection from the nearest sample
         known = close[beside < self.spacing**2]
         if len(known):
             x, coarse = x[known], coarse[known]
@@ -136,14 +137,14 @@ class SolidSurface:
         return out
 
     def deeper_than(self, depth: float) -> np.ndarray:
-        """Centres (k, 3) of the voxels at more than this depth."""
+        """Centres (k, 3) of the voxels deeper than `depth` [scene units]."""
         return self.voxels[self._coarse_depth(self.voxels) > depth]
 
     def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centres (m, 3) of the voxels in and around the body, which (m,) make it up, and the filled share (m,) of
-        each.
+        """Centres (m, 3) of the voxels in and around the body, a mask (m,) of the body, and their filled fraction (m,).
 
-        Those are the ones inside, and in sheets thinner than a voxel those of the coarse body.
+        The body consists of the voxels whose centre is inside the surface, and of the original voxels of sheets thinner
+        than a voxel.
         """
         near = surrounded(self._full)
         x = self._centres(near)
@@ -158,13 +159,13 @@ class SolidSurface:
         return x, inside[near], share
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (s, 3) on the surface, one in each voxel that has any, and normals (s, 3), outwards."""
+        """Points (s, 3) on the surface, one in each voxel that contains samples, and outward normals (s, 3)."""
         rows = self.thinned()
         points, normals = self.points[rows], self.normals[rows]
         return points + self.depth(points)[:, None] * normals, normals
 
     def samples_above(self, bottom: float) -> tuple[np.ndarray, np.ndarray]:
-        """Those above a height, and others on the face at which the body ends there, with the same spacing."""
+        """The `samples` of the body cut off at the height `bottom`, with one per voxel on the face of the cut."""
         points, normals = self.samples()
         kept = points[:, 2] > bottom - ON_CUT * self.h
         points, normals = np.maximum(points[kept], [-np.inf, -np.inf, bottom]), normals[kept]
@@ -177,17 +178,17 @@ class SolidSurface:
         return np.concatenate([points[~replaced], face]), np.concatenate([normals[~replaced], down])
 
     def _ends_at(self, x: np.ndarray) -> np.ndarray:
-        """Whether (k,) a body that is cut off at the height of points (k, 3) ends there, not in a face above."""
+        """Whether (k,) the body reaches down to the cut plane at points (k, 3) on it, and does not end above."""
         depth, _ = self.depth_grid()
         return self._at(depth, x + [0, 0, self.h / 2]) > (0.5 - ON_CUT) * self.h
 
     def thinned(self) -> np.ndarray:
-        """Rows (s,) of the first of the points in each voxel that has any."""
+        """Rows (s,) of the first sample in each voxel that contains samples."""
         index = np.ravel_multi_index(tuple(self._cells(self.points).T), self._full.shape)
         return np.unique(index, return_index=True)[1]
 
     def depth_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Depths (x, y, z) below the surface at the centres of voxels in and around the body; the first centre."""
+        """Depth (x, y, z) below the surface at the centres of a grid of voxels, and the centre (3,) of the first."""
         if self._fine_grid is None:
             grid = self._depth.copy()
             close = np.abs(grid) < 2 * self.h
@@ -207,15 +208,17 @@ class SolidSurface:
         return np.floor((x - self._first) / self.h + 0.5).astype(np.int64)
 
     def _centres(self, mask: np.ndarray) -> np.ndarray:
-        """Centres (k, 3) of the voxels of a mask of the grid."""
+        """Centres (k, 3) of the voxels selected by a mask of the grid."""
         return self._first + self.h * np.argwhere(mask)
 
 
 def _face_beside(
     points: np.ndarray, middle: np.ndarray, normals: np.ndarray, outward: np.ndarray, bent: np.ndarray, spacing: float
 ) -> np.ndarray:
-    """Rows (n,) of the samples whose planes, at `middle` (n, 3), those at points (n, 3) are on: its own, and for one at
-    an edge that of a sample beside it, on a face, on which it is.
+    """Rows (n,) of the planes, through `middle` (n, 3), that the samples at `points` (n, 3) take.
+
+    A sample takes its own plane or, at an edge, that of a neighbour on a flat face, if the sample lies on that plane.
+    `bent` (n,) is the RMS distance of the neighbours from a sample's plane [spacing].
     """
     row = np.minimum(cKDTree(points).query(points, NEIGHBOURS)[1], len(points) - 1)
     off = np.abs(((points[:, None] - middle[row]) * normals[row]).sum(-1)) / spacing
@@ -225,9 +228,9 @@ def _face_beside(
 
 
 def _planes(points: np.ndarray, squares: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point (n, 3) on the plane that fits each row of points (n, k, 3) with weights (n, k), and its normal (n, 3).
+    """Fit a plane to each row of points (n, k, 3) with weights (n, k): a point (n, 3) on it and its normal (n, 3).
 
-    `squares` (n, k, 6) are the products of their coordinates in PAIRS; points are about the origin.
+    The points are relative to a sample; `squares` (n, k, 6) are the products of their coordinates in PAIRS.
     """
     total = weight.sum(1, keepdims=True)
     middle, second = ((weight[:, None] @ x)[:, 0] / total for x in (points, squares))
@@ -236,7 +239,7 @@ def _planes(points: np.ndarray, squares: np.ndarray, weight: np.ndarray) -> tupl
 
 @cached_in_scene
 def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
-    """The surface of an object. Raises InputError for one without any usable Gaussian."""
+    """The surface of an object. Raises InputError if none of its Gaussians is usable."""
     voxels, h = filled_voxels(scene, object_id, _voxels_along(scene, object_id), seed)
     means = usable_means(scene, object_id)
     means = means[inliers(means)] if len(means) else means
@@ -244,8 +247,9 @@ def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
 
 
 def _voxels_along(scene: Scene, object_id: int) -> int:
-    """Number of voxels along an object, which has about VOXELS_ALONG^3 in its bounding box: more along a flat or long
-    one, and along one that is larger than the others and has Gaussians as dense.
+    """Number of voxels along the longest side of an object, so that its bounding box has about VOXELS_ALONG^3.
+
+    Flat or long objects, and those larger than the other objects, get more, if their Gaussians are dense enough.
     """
     own, sides = _means(scene, object_id), _sides(scene)
     some = own[:: -(-max(len(own), 1) // 2000)]
@@ -259,7 +263,7 @@ def _voxels_along(scene: Scene, object_id: int) -> int:
 
 @cached_in_scene
 def _sides(scene: Scene) -> dict[int, np.ndarray]:
-    """Sides (3,) of the bounding box of each object without outliers, by its id."""
+    """Sides (3,) of the bounding box of each object (1 to 99 % quantiles), by object id."""
     sides = {}
     for o in scene.objects:
         means = _means(scene, o.id)
@@ -269,6 +273,6 @@ def _sides(scene: Scene) -> dict[int, np.ndarray]:
 
 
 def _means(scene: Scene, object_id: int) -> np.ndarray:
-    """Centres of an object's Gaussians (n, 3) that are finite."""
+    """Finite centres (n, 3) of an object's Gaussians."""
     x = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu().double().numpy()
     return x[np.isfinite(x).all(1)]

@@ -16,4 +16,4 @@ class FrameState:
     com: Float[Tensor, "o 3"]  # centre of mass of each object, in the order of scene.objects
     rotation: Float[Tensor, "o 4"]  # w x y z, relative to the rest pose
     mass: Float[Tensor, "o"] | None = None  # of each object [kg]; live sessions need it
-    start: FieldStart | None = None  # of the learned engine, in the first frame
+    start: FieldStart | None = None  # initial state of the learned engine, in the first frame only

@@ -1,22 +1,23 @@
-"""Simulate many independent scenes at once, by name, as the data set needs it.
+"""Simulate many independent scenes at once, by name, as for the data set.
 
     batch = Batch({"a": particles_a, "b": particles_b}, Box((-1, -1, 0), (1, 1, 2)), dx=0.04, device="cuda")
     for frame in batch.frames(100, 0.02, 200, (0.0, 0.0, -5.0)):   # the first is the initial state
         frame.x, frame.F            # (p, 3) [m] and (p, 3, 3) of all scenes, on the device, in the original order
-        frame.of("b").x             # of one scene: a view
+        frame.of("b").x             # a view of one scene
     batch.failures()                # {"b": "particle 17 left the box or is not finite (frame 31)"}
 
-Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with values of each or all; set `.v`, `.held`
-and `.model` afterwards, and join bodies with `solver.join_particles`. The caller keeps track of which body a particle
-belongs to: rows keep their order. Scenes have the same box, spacing, substep and colliders. On a GPU a scene takes
-about 52 bytes per node of the box, active or not, and 700 per particle: `Batch.fits` computes how many scenes fit.
+Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with one value per particle or one for all; set
+`.v`, `.held` and `.model` afterwards, and join bodies with `solver.join_particles`. Rows keep their order, so that the
+caller can keep track of which body a particle belongs to. All scenes have the same box, spacing, substep and colliders.
+On a GPU a scene takes about 52 bytes per node of the box, active or not, and 700 per particle; `Batch.fits` computes
+how many scenes fit.
 
 `batch.solver.substeps(duration, acceleration)` is the number of substeps by the CFL condition; fewer may diverge. With
-the schedule `exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, at about twice
+the schedule `exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, in about twice
 the time.
 
-Frames do not wait for the device, and their tensors stay valid. A scene in which a particle leaves the box or is not
-finite is listed by `failures` with the frame in which that happened; the other scenes are not affected.
+Frames are returned without waiting for the device, and their tensors stay valid. If a particle leaves the box or is not
+finite, `failures` lists its scene with the frame in which that happened; the other scenes are not affected.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ from stages.core.physics.mpm.solver import (
     max_batch_nodes,
 )
 
-GRID_BYTES = 48  # per node: three grids, twice as much when exact
-NODE_BYTES = 4.5  # per node: friction and block flags
-PARTICLE_BYTES = 700  # per particle, with buffers for sorting
+GRID_BYTES = 48  # of the three grids [bytes/node]; twice as much for `exact`
+NODE_BYTES = 4.5  # of friction and block flags [bytes/node]
+PARTICLE_BYTES = 700  # including buffers for sorting [bytes/particle]
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class BatchFrame:
     """State of all scenes of a batch at one time."""
 
     names: tuple[str, ...]
-    starts: tuple[int, ...]  # first row of each scene, then the number of rows
+    starts: tuple[int, ...]  # first row of each scene, followed by the total number of rows
     x: Float[Tensor, "p 3"]  # [m]
     F: Float[Tensor, "p 3 3"]  # deformation gradients; their elastic part for plastic materials
 
@@ -92,7 +93,10 @@ class Batch:
     def frames(
         self, count: int, duration: float, substeps: int, gravity: tuple[float, float, float]
     ) -> Iterator[BatchFrame]:
-        """`count` frames, the first being the current state, `duration` [s] and `substeps` apart; gravity [m/s^2]."""
+        """Yield `count` frames, the first being the current state.
+
+        Frames are `duration` [s] apart, with `substeps` substeps in between; `gravity` [m/s^2].
+        """
         rows = self.solver.rows
         acceleration = torch.tensor(gravity, device=self.solver.device).repeat(len(rows), 1)
         for n in range(count):
@@ -110,7 +114,7 @@ class Batch:
         return torch.where(lost < 0, -1, lost - first).int(), self._failure_frame
 
     def failures(self) -> dict[str, str]:
-        """Description of the failure of each failed scene; waits for the device."""
+        """Description of the failure of each failed scene, by name; waits for the device."""
         particle, frame = (t.tolist() for t in self.lost())
         return {
             name: f"particle {p} left the box or is not finite (frame {f})"

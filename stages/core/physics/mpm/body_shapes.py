@@ -1,4 +1,4 @@
-"""Signed distances to the surfaces of undeformed bodies, which decide where bodies of the solver touch."""
+"""Signed distances to the surfaces of undeformed bodies, from which the MPM solver computes gaps between bodies."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from stages.core.kernels.mpm.contact import ContactBodies
 from stages.core.physics.morphology import surrounded
 from stages.core.physics.solid_surface import NEAREST, SAME_FACE, SolidSurface
 
-SHEET = 0.5  # depth of the middle of what is thicker than a texel, whose surface the lattice resolves [texels]
-MARGIN = 5  # texels around a body, whose particles reach nodes within 1.5 cells of two texels
-PATCH = 0.75  # radius of the part of a tangent plane that belongs to a sample [spacings of samples], about sqrt(1/2)
+SHEET = 0.5  # depth reached only in parts thicker than a texel, whose surface the lattice resolves [texels]
+MARGIN = 5  # width of the lattice around a body [texels]; particles reach nodes within 1.5 cells of two texels each
+PATCH = 0.75  # radius around a sample in which its tangent plane applies [sample spacing], about sqrt(1/2)
 
 
 class BodyShape(NamedTuple):
     """Signed distance to the surface of a body on a lattice in its material coordinates."""
 
     distance: np.ndarray  # (x, y, z), negative inside [m]
-    origin: np.ndarray  # (3,) of the first texel [m]
+    origin: np.ndarray  # (3,) position of the first texel [m]
     spacing: float  # of the texels [m]
 
     def scaled(self, unit: float) -> BodyShape:
-        """The same shape, `unit` times as large."""
+        """The shape with all lengths multiplied by `unit`."""
         return BodyShape(self.distance * unit, self.origin * unit, self.spacing * unit)
 
 
 def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None) -> BodyShape:
     """The shape of a body with a particle in each voxel of edge h, at positions x (p, 3).
 
-    Where it is thick its surface is that of `surface`, by planes fitted to the samples, elsewhere that of the voxels.
+    Around thick parts the distance is to the planes fitted to the samples of `surface`, elsewhere to the voxel faces.
     """
     cells = np.floor(x / h).astype(np.int64)
     low = cells.min(0) - MARGIN
@@ -58,7 +58,7 @@ def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None
 
 
 def _distance(surface: SolidSurface, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Signed distances (k,) of points x (k, 3): to the planes of the nearest samples, beside those to the samples."""
+    """Signed distances (k,) of points x (k, 3) to the planes of the nearest samples, or beside a patch to its rim."""
     points, normals = surface.fitted.points, surface.fitted.normals
     away, row = cKDTree(points).query(x, NEAREST)
     row = np.minimum(row, len(points) - 1)
@@ -70,7 +70,7 @@ def _distance(surface: SolidSurface, x: np.ndarray, inside: np.ndarray) -> np.nd
 
 
 class BodyContact:
-    """The shapes and friction coefficients of bodies in contact, as the kernels read them (`bodies`)."""
+    """The shapes and friction coefficients of bodies in contact; `bodies` is the struct that the kernels read."""
 
     def __init__(self, shapes: Sequence[BodyShape], friction: Float[Tensor, "s"], device: str):
         self.count = len(shapes)
@@ -92,6 +92,6 @@ class BodyContact:
 
 
 def _texels(shape: BodyShape) -> np.ndarray:
-    """Gradient and distance (x y z, 4)."""
+    """Gradient and signed distance (x y z, 4) at each texel, flattened."""
     slope = np.stack(np.gradient(shape.distance, shape.spacing), -1)
     return np.concatenate([slope, shape.distance[..., None]], -1).reshape(-1, 4).astype(np.float32)

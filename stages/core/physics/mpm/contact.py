@@ -1,7 +1,7 @@
-"""MPM substeps of bodies in contact as four kernel launches each: the schedule for a GPU.
+"""GPU schedule for bodies in contact: MPM substeps of up to five kernel launches each.
 
-These are particles, grid, the nearest particles at nodes, and contact; and where parts of bodies are pinned, the nodes
-at their faces.
+They are the particle step, the grid step, the search for the nearest particle of each node (every REFRESH substeps),
+the contact step and, if parts of bodies are pinned, the step of the nodes at the faces of these parts.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class ContactSubsteps(GraphedFrames):
         self._nodes.nearest, self._nodes.scale = view(self._nearest), self._scale
         self._part = ParticlePart()
         self._part.stop = len(rows)
-        self._times: dict[tuple[float, int], Tensor] = {}  # of the substeps [s]; the graphs read them
+        self._times: dict[tuple[float, int], Tensor] = {}  # of the substeps [s]; kept because the graphs read them
         self._pins: Pins | None = None
 
     def pin(self, pins: Pins) -> None:
         """Let these pins act from the next frame on."""
         self._pins = pins
-        self._graphs.clear()  # they read the pins before
+        self._graphs.clear()  # the captured graphs read the previous pins
 
     def _grids(self) -> list[Tensor]:
         return [self._velocity]

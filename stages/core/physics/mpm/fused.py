@@ -1,4 +1,4 @@
-"""MPM substeps as one kernel launch each over three rotating grids: the GPU schedule."""
+"""GPU schedule: MPM substeps as one kernel launch each, over three rotating grids."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stages.core.physics.mpm.particle_rows import ParticleRows
 
 
 class FusedSubsteps(GraphedFrames):
-    """Runs the substeps of a frame; parameters as in SplitSubsteps."""
+    """Runs the substeps of a frame; arguments as in SplitSubsteps, `scale` as in GraphedFrames."""
 
     def __init__(self, rows: ParticleRows, features: Features, scale: tuple[float, float] | None = None):
         super().__init__(rows, scale)
@@ -39,7 +39,7 @@ class FusedSubsteps(GraphedFrames):
         launch(self._kernel, threads, inputs, device=self.device, block_dim=THREADS_PER_BLOCK)
 
     def _roles(self, number: int):
-        """The grids as a substep uses them."""
+        """The grids in their roles of substep `number`: read, written and cleared."""
         read, write, stale = (self._rotating[(number + shift) % 3] for shift in (2, 0, 1))
         columns = {"read": read, "write": write, "stale": stale, "friction": self._friction}
         nodes = with_arrays(RotatingNodes(), columns)

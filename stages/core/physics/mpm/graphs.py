@@ -1,4 +1,4 @@
-"""The substeps of a frame as one CUDA graph: what the GPU schedules have in common.
+"""Base class of the GPU schedules: the substeps of a frame as one CUDA graph.
 
 The host does not synchronise with the device within a frame. The schedules also run on the CPU, on one thread, for
 comparison in tests.
@@ -18,8 +18,8 @@ from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
 SORT_INTERVAL = 100  # substeps after which particles are sorted by cell again
-CLEAR_ALIGNMENT = 256  # the threads that clear the grid begin at a multiple of this
-MAX_GRAPHS = 24  # CUDA graphs kept, one per number of substeps
+CLEAR_ALIGNMENT = 256  # the threads that clear the grid start at a multiple of this
+MAX_GRAPHS = 24  # CUDA graphs kept, one per substep duration and number of substeps
 
 
 class GraphedFrames(ABC):
@@ -51,7 +51,7 @@ class GraphedFrames(ABC):
         """One to three grids of the same size to clear at the end of a frame."""
 
     def frame(self, dt: float, steps: int) -> None:
-        """Take `steps` substeps of `dt` [s]: launched one by one the first time with these, then as a graph."""
+        """Take `steps` substeps of `dt` [s]: kernel by kernel the first time with these arguments, then as a graph."""
         if self.device == "cpu":
             self._run(dt, steps)
             return

@@ -1,4 +1,4 @@
-"""Particle arrays of all scenes in the layout of the kernels: persistent memory, sorted by grid cell."""
+"""Particle arrays of all scenes in the layout of the kernels: in persistent memory, sorted by grid cell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TYPES = {
 
 
 class ParticleRows:
-    """Tensors by name in `tensors`, all in the same row order, and a struct of the same memory for the kernels.
+    """Particle tensors by name (`tensors`), all in the same row order, and the kernels' struct over the same memory.
 
     `sizes` is the number of particles of each scene.
     """
@@ -41,7 +41,7 @@ class ParticleRows:
         self.struct = kernels.ParticleArrays()
         self.struct.count = p
         for name, t in self.tensors.items():
-            if t.numel():  # particles without Maxwell branches have none of these columns
+            if t.numel():  # the columns of Maxwell branches are empty if there are none
                 setattr(self.struct, name, view(t, _TYPES.get(name)))
         self.struct.lost = view(self.lost)
 
@@ -54,7 +54,7 @@ class ParticleRows:
     def sort(self) -> None:
         """Sort by grid cell, so that neighbours in space are neighbours in memory. Does not wait for a GPU."""
         launch(kernels.sort_keys, len(self), [self.grid, self.struct, view(self._keys)], device=self.device)
-        if self.device == "cpu":  # NumPy: PyTorch's threads cost more than they save here, and stall on a busy machine
+        if self.device == "cpu":  # PyTorch's threads cost more than they save here, and stall on a busy machine
             order = self._keys.numpy().argsort(kind="stable")
             for t in self.tensors.values():
                 t.numpy()[:] = t.numpy()[order]

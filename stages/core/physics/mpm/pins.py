@@ -1,7 +1,7 @@
-"""The nodes at the faces of pinned parts of bodies, for the kernel of core/kernels/mpm/pins.py.
+"""Find the grid nodes at the faces of pinned parts of bodies, for the kernel of core/kernels/mpm/pins.py.
 
-The shares of pinned and free particles in the volume at a node, by the weights of the transfers, give a plane at every
-node that both reach; distances from the face are averages of those from the planes nearby.
+At each node that both pinned and free particles reach, their fractions of the scattered volume give a plane that
+approximates the face. A node's distance from the face is the weighted mean of its distances from the nearby planes.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from stages.core.kernels.mpm import pins as kernels
 from stages.core.kernels.mpm.transfers import FREE, KINEMATIC, PINNED
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
-OUTSIDE = 1.5  # distance from which nodes are masters [cells]: that from which B-splines are zero at the face
-DIAGONAL = 3**0.5  # of a cell, within which there is a node in any direction
-NEIGHBOURS, NEAR = 16, 4.0  # planes that give a distance, and how far away they may be [cells]
-DISTANCES = np.linspace(1.5, -1.5, 3001)
+OUTSIDE = 1.5  # distance from the face above which nodes are masters [cells]: their B-splines vanish at the face
+DIAGONAL = 3**0.5  # of a cell; a full grid has a node within this distance of any point [cells]
+NEIGHBOURS, NEAR = 16, 4.0  # planes averaged for a distance, and their largest distance [cells]
+DISTANCES = np.linspace(1.5, -1.5, 3001)  # at which `share_below` is tabulated [cells]
 STENCIL = np.indices((3, 3, 3)).reshape(3, -1).T
 
 
 class FaceNodes(NamedTuple):
-    """Nodes with their masters."""
+    """Slave nodes at the face of a pinned part, each with its master node."""
 
-    at_face: np.ndarray  # (p,) whether a particle is pinned, and shares nodes with free ones and one inside the face
+    at_face: np.ndarray  # (p,) whether a particle is pinned and reaches both free particles and a node inside the face
     slaves: np.ndarray  # (s, 3) indices along x, y, z
-    masters: np.ndarray  # (s, 3), -1 where there is none
-    ratio: np.ndarray  # (s,) of the velocities of a slave and its master
+    masters: np.ndarray  # (s, 3) indices along x, y, z; -1 for a slave without a master
+    ratio: np.ndarray  # (s,) velocity of a slave over that of its master
 
 
 class Pins:
-    """The nodes at the faces of parts that are pinned at rest, where the rest of their body is free.
+    """Nodes at the faces between pinned parts at rest and the free rest of their body; each scene of `rows` is a body.
 
-    Bodies are the scenes of `rows`. Pinned particles at faces become PINNED, and so add nothing to the grid. In what is
-    too thin for a node of its own they stay KINEMATIC, and hold all nodes that they reach.
+    Pinned particles at faces become PINNED, which excludes them from the scatter. In parts too thin to contain a node
+    they stay KINEMATIC, and hold all nodes that they reach.
     """
 
     def __init__(self, rows: ParticleRows):
@@ -59,7 +59,7 @@ class Pins:
         slaves, masters, ratio = np.concatenate(found, 1)
         order = np.lexsort((slaves, masters))
         masters = masters[order]
-        # a thread for each master, and for each slave without one
+        # one thread per master, and one per slave without a master
         starts = ((np.diff(masters, prepend=-1) != 0) | (masters < 0)).nonzero()[0]
         self.count, self.nodes = len(starts), kernels.PinnedNodes()
         columns = masters[starts], np.append(starts, len(slaves)), slaves[order], ratio[order]
@@ -70,16 +70,16 @@ class Pins:
 
 
 def face_nodes(g: np.ndarray, volume: np.ndarray, pinned: np.ndarray) -> FaceNodes:
-    """The nodes at the faces between the `pinned` (p,) and the other particles of a body.
+    """Find the nodes at the faces between the `pinned` (p,) and the other particles of a body.
 
-    g (p, 3): positions [cells], node (i, j, k) being at (i, j, k); volume (p,), in any unit.
+    `g` (p, 3) are positions [cells], with node (i, j, k) at (i, j, k); `volume` (p,) is in any unit.
     """
     base = np.floor(g - 0.5).astype(np.int64)
-    low, size = base.min(0) - 1, np.ptp(base, 0) + 5  # with a layer around for gradients
+    low, size = base.min(0) - 1, np.ptp(base, 0) + 5  # padded by one layer for the gradients
     f = g - base
     weight = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])
     nodes = [np.ravel_multi_index(tuple((base - low + step).T), size) for step in STENCIL]
-    free, held = np.zeros(size), np.zeros(size)  # volumes
+    free, held = np.zeros(size), np.zeros(size)  # scattered volumes of free and pinned particles
     for at, (i, j, k) in zip(nodes, STENCIL, strict=True):
         w = volume * weight[i, :, 0] * weight[j, :, 1] * weight[k, :, 2]
         for to, mine in ((free, ~pinned), (held, pinned)):
@@ -98,7 +98,7 @@ def face_nodes(g: np.ndarray, volume: np.ndarray, pinned: np.ndarray) -> FaceNod
     d, normal = _distances(free, held, x)
     reached, moving = (a.reshape(size)[tuple(x.T)] for a in (reached, moving))
     master, slave = moving & (d >= OUTSIDE), reached & ((d < OUTSIDE) | ~moving)
-    above = x[slave] + (OUTSIDE - d[slave, None]) * normal[slave]  # where the normal reaches the masters
+    above = x[slave] + (OUTSIDE - d[slave, None]) * normal[slave]  # along the normal, at the distance of the masters
     away, row = cKDTree(x[master]).query(above, distance_upper_bound=DIAGONAL)
     led = moving[slave] & np.isfinite(away)
     masters, ratio = np.full((len(led), 3), -1), np.zeros(len(led))
@@ -109,7 +109,8 @@ def face_nodes(g: np.ndarray, volume: np.ndarray, pinned: np.ndarray) -> FaceNod
 def _distances(free: np.ndarray, held: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (n,) [cells] of nodes x (n, 3) to the face of the pinned part, and its outward normals (n, 3).
 
-    free, held (nx, ny, nz): volumes at nodes, some with both. Far from these distances are infinite.
+    `free` and `held` (nx, ny, nz) are the volumes at nodes; some nodes must have both. Beyond NEAR from these nodes the
+    distance is infinite.
     """
     both = np.stack(np.nonzero((free > 0) & (held > 0)), 1)
     at = tuple(both.T)
@@ -122,7 +123,7 @@ def _distances(free: np.ndarray, held: np.ndarray, x: np.ndarray) -> tuple[np.nd
     away, row = cKDTree(both).query(x, NEIGHBOURS, distance_upper_bound=NEAR)
     known = row < len(both)
     row = np.minimum(row, len(both) - 1)
-    # the planes are best where a node is full, and both kinds of particles have a part in it
+    # planes are most accurate at full nodes to which pinned and free particles both contribute
     best = total * share * (1 - share)
     weight = np.where(known, best[row] * np.exp(-np.square(np.minimum(away, NEAR)) / 2), 0)
     weight /= np.maximum(weight.sum(1, keepdims=True), 1e-300)
@@ -133,7 +134,7 @@ def _distances(free: np.ndarray, held: np.ndarray, x: np.ndarray) -> tuple[np.nd
 
 
 def share_below(d: np.ndarray) -> np.ndarray:
-    """Share of a half-space in the weights at nodes at signed distances d from its face [cells]."""
+    """Fraction of a node's B-spline inside a half-space, for nodes at signed distances d from its face [cells]."""
     a = np.abs(d)
-    tail = np.where(a < 0.5, 0.5 - 0.75 * a + a**3 / 3, np.maximum(1.5 - a, 0) ** 3 / 6)  # of a quadratic B-spline
+    tail = np.where(a < 0.5, 0.5 - 0.75 * a + a**3 / 3, np.maximum(1.5 - a, 0) ** 3 / 6)  # of the quadratic B-spline
     return np.where(d < 0, 1 - tail, tail)

@@ -6,8 +6,8 @@ by the schedule of split.py on the CPU and of fused.py on a GPU, with the same p
 Reproducibility: on the CPU a run gives the same bytes for any number of threads. On a GPU floating-point sums depend on
 the order of atomic additions, so runs differ in the last bits, unless the schedule is `exact`, which sums in fixed
 point. Even then the friction of a node shared by bodies of different friction may change one substep earlier or later,
-since the fused kernel raises it while others read it.
-Gradients through the solver are not available.
+because threads of the fused kernel raise it while others read it.
+The solver is not differentiable.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
 from stages.core.physics.mpm.pins import Pins
 from stages.core.physics.mpm.split import SplitSubsteps
 
-SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a substep, see substep_rate
+SAFETY = 0.5  # Courant number: fraction of a cell that the fastest wave and particle cross in a substep (substep_rate)
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
 SCHEDULES = ("auto", "split", "fused", "exact", "contact")
-# as FLOOR_GAP, where the floor is in contact with bodies; see STATIC_REACH in kernels/mpm/contact.py
+# FLOOR_GAP of the schedule `contact`, where the floor is a contact plane [cells]; see STATIC_REACH in
+# kernels/mpm/contact.py
 CONTACT_FLOOR_GAP = 0.7
-CONTACT_NODE_BYTES = 60  # velocity, momentum in fixed point, friction and nearest particle of a node on a GPU
-SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
+CONTACT_NODE_BYTES = 60  # velocity, fixed-point momentum, friction and nearest particle on a GPU [bytes/node]
+SUBSTEP_MULTIPLE = 8  # on a GPU, substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
 class Diverged(Exception):
@@ -70,8 +71,8 @@ class Particles:
     plastic: Float[Tensor, "p 3"]  # parameters of the material model
     state: Float[Tensor, "p"]  # internal variable of the material model; initially 0
     # Maxwell branches, none (b = 0) or two; see core/kernels/mpm/constitutive.py
-    branch_modulus: Float[Tensor, "p b"]  # over the elastic moduli
-    branch_rate: Float[Tensor, "p b"]  # relaxation [1/s]
+    branch_modulus: Float[Tensor, "p b"]  # relative to the elastic moduli
+    branch_rate: Float[Tensor, "p b"]  # relaxation rate [1/s]
     branch_strain: Float[Tensor, "p b 3 3"]  # left Cauchy-Green tensor of the springs, less the identity
 
     def __len__(self) -> int:
@@ -79,7 +80,7 @@ class Particles:
 
 
 class ParticleMaterial(NamedTuple):
-    """Material constants of each particle, or of all."""
+    """Material constants, one value per particle or one for all."""
 
     E: Float[Tensor, "p"] | float  # Young's modulus [Pa]
     nu: Float[Tensor, "p"] | float  # Poisson ratio
@@ -92,7 +93,7 @@ def at_rest(
     x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"] | float, material: ParticleMaterial, model: int = NEO_HOOKEAN,
     plastic: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Particles:  # fmt: skip
-    """Undeformed particles at `x` [m] without velocity, of the given `volume` [m^3] each.
+    """Undeformed particles at rest at `x` [m], with the given `volume` [m^3] per particle.
 
     `model` (number of the material model) and `plastic` (its parameters) apply to all; overwrite the fields for a
     mixture.
@@ -111,7 +112,7 @@ def at_rest(
 def with_branches(
     particles: Particles, modulus: Float[Tensor, "p 2"], rate: Float[Tensor, "p 2"]
 ) -> Particles:  # fmt: skip
-    """The same with two relaxed Maxwell branches of these moduli, over the elastic ones, and relaxation rates [1/s]."""
+    """The particles with two relaxed Maxwell branches: moduli relative to the elastic ones, relaxation rates [1/s]."""
     return replace(
         particles, branch_modulus=modulus, branch_rate=rate, branch_strain=torch.zeros(len(modulus), 2, 3, 3)
     )
@@ -135,33 +136,33 @@ def modulus_at_wave_speed(speed: float, nu: float, density: float) -> float:
 def substep_rate(dx: float, speed: float, viscosity: float = 0.0) -> float:
     """Substeps per second [1/s] at which explicit integration is stable, by the CFL condition.
 
-    `dx` grid spacing [m]; `speed` of the fastest pressure wave and particle together [m/s]; `viscosity` eta / density
-    [m^2/s]. The Courant number is SAFETY: free vibration of a block diverges from 1.1, but falling shells gain energy
-    from 0.7, since boundaries are less stable than the interior. Masses and rest volumes are constant, so density is
-    that at rest. Source: Sun, Shinar and Schroeder 2020, "Effective time step restrictions for explicit MPM
-    simulation"; Bai and Schroeder 2022, "Stability analysis of explicit MPM".
+    `dx` is the grid spacing [m], `speed` the sum of the speeds of the fastest pressure wave and the fastest particle
+    [m/s], and `viscosity` eta / density [m^2/s]. The Courant number is SAFETY: free vibration of a block diverges from
+    1.1, but falling shells gain energy from 0.7, since boundaries are less stable than the interior. Masses and rest
+    volumes are constant, so the density is that at rest. Sources: Sun, Shinar and Schroeder 2020, "Effective time step
+    restrictions for explicit MPM simulation"; Bai and Schroeder 2022, "Stability analysis of explicit MPM".
     """
     return max(speed / (SAFETY * dx), viscosity / (VISCOUS * dx**2))
 
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Colliders, damping, schedule and shapes of the solver.
+    """Colliders, damping, schedule and body shapes of the solver.
 
     `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule` is one of
 
         auto      `split` on a CPU, `fused` on a GPU
         split     two launches per substep (split.py)
         fused     one launch per substep (fused.py)
-        exact     `fused` with sums in fixed point: a GPU then gives the same bytes in every run at about twice the
+        exact     `fused` with sums in fixed point: a GPU then gives the same bytes in every run in about twice the
                   time, and a scene the same result in any batch (unless a surface has restitution, whose stiffness
                   follows from the stiffest material of the batch)
         contact   `split`, or on a GPU contact.py with sums in fixed point; the scenes are bodies in one space, each
-                  with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py); otherwise
-                  bodies in one scene share the velocity of a node, and stick to each other
+                  with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py). With the other
+                  schedules, bodies in one scene share one velocity field, so they stick to each other
 
-    `shapes` are the surfaces of the bodies of the schedule `contact`, by default those of voxels of half a grid cell
-    with a particle each. Raises ValueError for another schedule.
+    `shapes` are the surfaces of the bodies for the schedule `contact`; by default the voxels, of half a grid cell, that
+    contain the particles. Raises ValueError for an unknown schedule.
     """
 
     colliders: tuple[Collider, ...] = ()
@@ -180,9 +181,9 @@ DEFAULTS = SolverOptions()
 class Solver:
     """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
-    `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
-    interact, except by the schedule `contact`. Raises ValueError for sizes that do not fit the particles and for grids
-    that are too large.
+    `sizes` gives the number of particles of each scene of a batch. Scenes have the same box and colliders, and interact
+    only with the schedule `contact`. Raises ValueError for sizes that do not match the particles and for grids that are
+    too large.
     """
 
     def __init__(
@@ -225,7 +226,7 @@ class Solver:
 
     @property
     def particles(self) -> Particles:
-        """The current state in the original order of the particles, on the solver's device."""
+        """The current state, with the particles in their original order, on the solver's device."""
         out = Particles(*(self.rows.get(f.name) for f in fields(Particles)))
         out.held[out.held == PINNED] = KINEMATIC
         return out
@@ -245,7 +246,10 @@ class Solver:
             self._pin()
 
     def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
-        """Number of substeps that are stable (substep_rate). Raises Diverged when a velocity is not finite."""
+        """Number of substeps for a stable frame (see substep_rate). Raises Diverged if a velocity is not finite.
+
+        `duration` [s] is that of the frame, `acceleration` [m/s^2].
+        """
         fast = self.rows["v"].norm(dim=1)
         speed = float(fast.max()) + float(acceleration.norm(dim=1).max()) * duration
         if not math.isfinite(speed):
@@ -267,7 +271,7 @@ class Solver:
         return steps
 
     def enqueue_frame(self, duration: float, acceleration: Float[Tensor, "p 3"], substeps: int) -> None:
-        """As `advance`, without waiting for the device: divergence is only recorded, in `lost`.
+        """As `advance`, but without waiting for the device: divergence is only recorded, in `lost`.
 
         A particle that would leave the box or is not finite stays in place; other scenes are not affected.
         """
@@ -279,7 +283,7 @@ class Solver:
 
     @property
     def lost(self) -> Int[Tensor, "s"]:
-        """First lost particle of each scene, or -1."""
+        """Index of the first lost particle of each scene, or -1."""
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
 
     def _pin(self) -> None:
@@ -290,7 +294,7 @@ class Solver:
     def _body_contact(
         self, particles: Particles, sizes: Sequence[int], shapes: Sequence[BodyShape] | None
     ) -> BodyContact:
-        """Shape and friction of each body, whose particles all have the same friction."""
+        """Shape and friction of each body; all particles of a body have the same friction."""
         if shapes is None:
             parts = particles.rest.cpu().double().split(list(sizes))
             shapes = [shape_of_voxels(x.numpy(), self.dx / 2) for x in parts]
@@ -299,16 +303,16 @@ class Solver:
         )
 
     def _quanta(self) -> tuple[float, float]:
-        """Fixed-point units per kg m/s and per kg: powers of two that depend on dx alone, not on the batch.
+        """Fixed-point units per kg m/s and per kg: powers of two that depend only on dx, not on the batch.
 
-        Full cells of 10 g/cm^3, kinematic ones at metres per second among them, fit into 63 bits; in a cell of foam one
+        Full cells of 10 g/cm^3, including kinematic ones at metres per second, fit into 63 bits; in a cell of foam one
         unit is a speed of 1e-11 m/s.
         """
         cell = math.ceil(math.log2(1e4 * self.dx**3))
         return 2.0 ** (47 - cell), 2.0 ** (42 - cell)
 
     def _max_rates(self) -> tuple[float, float]:
-        """Maximum pressure wave speed [m/s] and kinematic viscosity [m^2/s] of the particles that are free."""
+        """Maximum pressure wave speed [m/s] and kinematic viscosity [m^2/s] of the free particles."""
         moving = self.rows["held"] == 0
         if not bool(moving.any()):
             return 0.0, 0.0
@@ -320,12 +324,12 @@ class Solver:
 
 
 def max_batch_nodes(device: str) -> int:
-    """Maximum number of grid nodes of all scenes of a batch: indices have 31 bits, and the CPU keeps several copies."""
+    """Maximum total number of grid nodes of a batch: indices have 31 bits, and the CPU keeps several copies."""
     return 2 * MAX_NODES if device == "cpu" else 2**31 - 1
 
 
 def max_contact_nodes(device: str) -> int:
-    """Maximum number of grid nodes of all bodies in contact: on a GPU as many as half of its free memory holds."""
+    """Maximum total number of grid nodes of bodies in contact: on a GPU, as many as half of its free memory holds."""
     if device == "cpu":
         return MAX_NODES // 2
     return min(max_batch_nodes(device) // 4, int(0.5 * torch.cuda.mem_get_info(device)[0] / CONTACT_NODE_BYTES))
@@ -334,8 +338,9 @@ def max_contact_nodes(device: str) -> int:
 def make_grid(box: Box, dx: float, floor_contact: bool = False):
     """A grid whose boundary nodes lie FLOOR_GAP cells outside the box, so that bodies rest on its faces.
 
-    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node. With
-    `floor_contact` the floor is left to the contact of bodies. Raises ValueError when it has more than MAX_NODES nodes.
+    This is exact for the lower faces, including the floor; the upper faces are moved outwards to the next node. With
+    `floor_contact` the contact step handles the floor, not the boundary nodes. Raises ValueError if the grid would have
+    more than MAX_NODES nodes.
     """
     grid, n = mpm_grid.MpmGrid(), []
     for low, high in zip(box.low, box.high, strict=True):

@@ -1,8 +1,8 @@
-"""MPM substeps as two kernel launches, particles and grid: the CPU schedule.
+"""CPU schedule: MPM substeps as two kernel launches, particles and grid.
 
 The particles are split into a fixed number of parts, each of which scatters into its own copy of the momentum grid; the
-grid launch adds the copies in order. Threads launch the parts side by side, and since neither the parts nor the order
-of addition depend on the number of threads, neither does the result.
+grid launch adds the copies in order. Threads launch the parts in parallel. Neither the parts nor the order of the
+additions depend on the number of threads, so the result does not either.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from stages.core.physics.mpm.particle_rows import ParticleRows
 from stages.core.physics.mpm.pins import Pins
 
 CPU_PARTS = 4  # parts that the particles are split into on the CPU
-LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of a GPU warp
+LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of this, the size of a GPU warp
 MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch is split; a split costs about 5,000 rows
 
 
 class SplitSubsteps:
     """Runs the substeps of a frame for the particles in `rows`.
 
-    With `contact` the scenes of `rows` are bodies in contact with each other.
+    `features` selects the variant of the kernels. With `contact` the scenes of `rows` are bodies in contact with each
+    other.
     """
 
     def __init__(self, rows: ParticleRows, features: Features, contact: BodyContact | None = None):
@@ -78,13 +79,13 @@ class SplitSubsteps:
 
     def pin(self, pins: Pins) -> None:
         """Let these pins act from the next frame on."""
-        self._pins = pins  # whose memory the launch reads
+        self._pins = pins  # keeps the memory that the launch reads
         inputs = [pins.nodes, self._nodes.velocity]
         self._pin_commands = [self._record(pin_nodes, pins.count, inputs)] if pins.count else []
 
     @property
     def blocks(self) -> int:
-        """Number of active grid blocks, which are read, written and cleared in every substep."""
+        """Number of active grid blocks; these are read, written and cleared in every substep."""
         return len(self._blocks)
 
     def _particles(self, step) -> list[wp.Launch]:
@@ -98,7 +99,7 @@ class SplitSubsteps:
         return commands
 
     def _list_blocks(self, dt: float) -> None:
-        """List the active blocks with the momentum copies each needs, and mark friction at floor and walls."""
+        """List the active blocks with the momentum copies that each needs, and set the friction at floor and walls."""
         self._marks.zero_()
         self._stale.zero_()
         for part, (start, stop) in enumerate(self._ranges(len(self.rows))):
@@ -115,7 +116,7 @@ class SplitSubsteps:
         ranges = self._ranges(rows) if rows > MIN_SPLIT_ROWS else [(0, rows)]
         self._grid_commands = [
             self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs])
-            for start, stop in ranges if stop > start  # nothing to do when all particles are lost
+            for start, stop in ranges if stop > start  # empty if all particles are lost
         ]  # fmt: skip
         if self._contact is not None:
             self._contact_commands = self._contact_launches(dt, at[:, 0].int(), first - at[:, 0] * self.grid.count)
@@ -129,7 +130,7 @@ class SplitSubsteps:
         self._refresh = False
 
     def _contact_launches(self, dt: float, body: Tensor, corner: Tensor) -> list[wp.Launch]:
-        """The launches for contact; `body` has an active block, whose first node is `corner`."""
+        """The launches for contact. For each active block, `body` is its body and `corner` its first node."""
         self._refresh = True
         self._sharers = (self._marks > 0).sum(0, dtype=torch.int32).contiguous()
         floor = (self.grid.face_low[2] - self.grid.origin[2]) / self.grid.dx + STATIC_REACH
@@ -142,7 +143,7 @@ class SplitSubsteps:
         corners, count = corners[touch].int(), count[touch]
         starts = torch.cat([torch.zeros(1, dtype=torch.int64, device=count.device), count.cumsum(0)]).int()
         blocks = {"corners": corners, "starts": starts, "present": body[mine]}
-        self._touching = with_arrays(TouchingBlocks(), blocks)  # whose memory the launches read
+        self._touching = with_arrays(TouchingBlocks(), blocks)  # keeps the memory that the launches read
         near = [self.grid, self.rows.struct, view(self._sharers.flatten()), self._nodes.nearest]
         inputs = [self.grid, self.rows.struct, self._contact.bodies, self._nodes, self._touching]
         nodes = len(corners) * kernels.BLOCK**3
@@ -173,5 +174,5 @@ class SplitSubsteps:
 
 
 def _lazy_zeros(shape: tuple[int, ...], device: str) -> Tensor:
-    """Zeros; on the CPU the memory is committed only where it is touched (torch.zeros writes every page)."""
+    """Zeros; on the CPU, memory is committed only where it is touched (torch.zeros writes every page)."""
     return torch.from_numpy(np.zeros(shape, np.float32)) if device == "cpu" else torch.zeros(shape, device=device)

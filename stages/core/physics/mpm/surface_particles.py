@@ -1,9 +1,9 @@
-"""Particles of bodies with smooth surfaces, at the same or a finer spacing.
+"""Resample the particles of bodies so that they follow the smooth surface, at the same or a finer spacing.
 
-Where the voxels of a thick body end at its surface, particles carry the volume of the filled part of their voxel, which
-follows from the signed distance to the surface, by planes fitted to its samples (`solid_surface.py`). With whole voxels
-an inclined surface would be a staircase, and two of them would interlock. Sheets and what is reconstructed only as
-voxels keep whole voxels.
+At the surface of a thick body, a particle carries only the volume of the filled part of its voxel, which follows from
+the signed distance to the planes fitted to the surface samples (`solid_surface.py`). With whole voxels, an inclined
+surface would be a staircase, and two such surfaces would interlock. Sheets, and parts that the surface does not
+enclose, keep whole voxels.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.core.scene.scene import Scene
 
 MIN_FRACTION = 0.1  # filled fraction of a voxel below which it has no particle
-THICK = 0.75  # depth of the middle of what is thicker than sheets, which are thickened to three voxels [voxels]
-SHEET = 2.5  # depth of the middle of thickened sheets, at most [voxels of the surface]
+THICK = 0.75  # depth below the surface reached only in parts thicker than sheets [voxels of `bodies`]
+SHEET = 2.5  # largest depth in sheets, which the surface's own voxels thicken to three [voxels of the surface]
 
 
 def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: int = 0) -> Bodies:
-    """Particles of the same bodies at `spacing / refinement`; rows are ordered by body.
+    """Resample bodies at `spacing / refinement`; rows are ordered by body.
 
-    `bodies` have a particle in each voxel, up to the surface (`skin` of `sample_bodies`). Where bodies overlap, smaller
-    ones keep their volume, and a voxel is filled by at most its volume in all.
+    `bodies` must have a particle in each voxel, up to the surface (`skin` of `sample_bodies`). Where bodies overlap,
+    smaller ones take precedence, so that the bodies together never fill more than a voxel's volume.
     """
     h = bodies.spacing / refinement
     voxels = np.floor(bodies.x.double().numpy() / bodies.spacing).astype(np.int64)
@@ -43,7 +43,7 @@ def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: i
 
 
 def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Cells (m, 3) of edge h in and at a body of voxels, and the fractions (m,) of them that are filled."""
+    """Cells (m, 3) of edge h in and at a body of voxels, and their filled fractions (m,)."""
     low = voxels.min(0) - 2
     body = np.zeros(voxels.max(0) - low + 3, bool)
     body[tuple((voxels - low).T)] = True
@@ -61,7 +61,7 @@ def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface
 
 
 def _without_overlap(filled: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The fractions of cells of bodies, of which smaller ones come first, reduced to a sum of at most one."""
+    """Reduce the filled fractions so that they sum to at most one per cell; smaller bodies take precedence."""
     every = np.concatenate([cells for cells, _ in filled])
     span = np.ptp(every, axis=0) + 1
     every = (every - every.min(0)) @ np.array([span[1] * span[2], span[2], 1])

@@ -1,4 +1,4 @@
-"""Merging of objects that are parts of one body: their convex hulls interlock, or one is suspended from the other."""
+"""Merge objects that are parts of one body: their convex hulls interlock, or one is suspended from the other."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import Gaussians
 
-CELL_SIZE = 0.01  # of the grid that positions are thinned to [camera distance]
-MAX_CONTACT_DISTANCE = 2.0  # between touching points of two parts [cells]
-MIN_MUTUAL_OVERLAP = 0.05  # fraction of each part inside the convex hull of the other, for interlocking parts
-MIN_CONTACT_FRACTION = 0.05  # fraction of the smaller part that touches the larger
-MAX_STANDING_HEIGHT = 4.0  # of the lowest points of a part that stands on the table [support tolerances]
-MIN_BELOW_FRACTION = 0.25  # fraction of a part below its contact with another, for a suspended part
+CELL_SIZE = 0.01  # side of the grid cells to which positions are thinned [camera distance]
+MAX_CONTACT_DISTANCE = 2.0  # largest distance between touching points of two parts [cells]
+MIN_MUTUAL_OVERLAP = 0.05  # least fraction of each of two interlocking parts inside the convex hull of the other
+MIN_CONTACT_FRACTION = 0.05  # least number of touching points of interlocking parts [fraction of the smaller part]
+MAX_STANDING_HEIGHT = 4.0  # height of its lowest points up to which a part stands on the table [support tolerances]
+MIN_BELOW_FRACTION = 0.25  # least fraction of a suspended part below its contact with another part
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,12 @@ class ObjectPart:
 
 
 def merge_bodies(g: Gaussians, support: Support) -> Gaussians:
-    """The Gaussians with the objects that are parts of one body relabelled to the largest of them.
+    """The Gaussians, with objects that are parts of one body relabelled as the largest of them.
 
-    Criterion 1: each of two parts has points inside the convex hull of the other, as limbs and the trunk they
-    embrace; separate bodies do not (a spoon enters the hull of its cup, but not the cup that of the spoon).
-    Criterion 2: a part that neither extends to the table nor lies on top of another is attached to the part it touches.
+    Criterion 1: each of two parts has points inside the convex hull of the other, like limbs and the trunk they
+    embrace. Separate bodies do not: a spoon enters the hull of its cup, but the cup does not enter the hull of the
+    spoon. Criterion 2: a part that neither extends to the table nor lies on top of another belongs to the part it
+    touches.
     """
     ids = g.object_id.clone()
     finite = g.means.isfinite().all(1)
@@ -70,7 +71,7 @@ def merge_bodies(g: Gaussians, support: Support) -> Gaussians:
 
 
 def _next_pair(parts: dict[int, ObjectPart], side: float) -> tuple[int, int] | None:
-    """The next two parts to merge: interlocking ones first, then the suspended one with the largest contact."""
+    """The next two parts to merge: interlocking parts first, then the suspended part with the largest contact."""
     trees = {n: cKDTree(part.points) for n, part in parts.items()}
     suspended: list[tuple[float, int, int]] = []
     for a, part in parts.items():

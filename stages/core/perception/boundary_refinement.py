@@ -1,4 +1,4 @@
-"""Boundary refinement: relabels Gaussians near boundaries of objects by colour, height and neighbouring labels."""
+"""Boundary refinement: relabel Gaussians near the boundaries of objects by colour, height and neighbouring labels."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-BOUNDARY_WIDTH = 0.015  # of a boundary to either side, about 10 pixels of a photo [camera distance]
-MIN_VISIBLE_WEIGHT = 0.5  # summed over all photos, from which a Gaussian is visible [px of downscaled photos]
-ROUNDS = 3  # in each, a boundary may move by BOUNDARY_WIDTH
+BOUNDARY_WIDTH = 0.015  # width of a boundary on either side, about 10 pixels of a photo [camera distance]
+MIN_VISIBLE_WEIGHT = 0.5  # weight, summed over all photos, above which a Gaussian is visible [px of downscaled photos]
+ROUNDS = 3  # in each round, a boundary may move by BOUNDARY_WIDTH
 MEAN_FIELD_ITERATIONS = 8  # per round
-COLOUR_SAMPLES = 24  # nearest Gaussians that a label's local colour distribution is estimated from
-NEIGHBOURS = 8  # that the smoothness term connects
+COLOUR_SAMPLES = 24  # nearest Gaussians from which a label's local colour distribution is estimated
+NEIGHBOURS = 8  # nearest neighbours that the smoothness term connects
 MIN_BOUNDARY_NEIGHBOURS = 5  # Gaussians of another label that form a boundary; fewer are strays
 COLOUR_SIGMA = 8.0  # standard deviation of the colour likelihood [CIELAB]
-MIN_COLOUR_LIKELIHOOD = 0.02  # of a colour that no nearby Gaussian of the label has
+MIN_COLOUR_LIKELIHOOD = 0.02  # likelihood of a colour that no nearby Gaussian of the label has
 HEIGHT_RESOLUTION = 0.0045  # smallest height that photos distinguish from the table [camera distance]
-TABLE_HEIGHT_SIGMA = 3.0  # standard deviation of the height of bare table next to objects [HEIGHT_RESOLUTION]
-OBJECT_HEIGHT_SIGMA = 0.5  # of an object's Gaussians below HEIGHT_RESOLUTION [HEIGHT_RESOLUTION]
-TABLE_COLOUR_SAMPLES = 400  # Gaussians that the global colour distribution of the table is estimated from
-SMOOTHNESS = 3.0  # weight of all neighbours together, if of the same colour, relative to the unary cost
-MIN_SMOOTHNESS = 0.1  # added to the colour likeness of a neighbour
-CORE_QUANTILE = 0.67  # of the distance to the boundary, beyond which a thin object's colour is trusted
-FORBIDDEN = 1e3  # cost of a label that is excluded
+TABLE_HEIGHT_SIGMA = 3.0  # standard deviation of the height of the table next to objects [HEIGHT_RESOLUTION]
+OBJECT_HEIGHT_SIGMA = 0.5  # standard deviation of an object's Gaussians below HEIGHT_RESOLUTION [HEIGHT_RESOLUTION]
+TABLE_COLOUR_SAMPLES = 400  # Gaussians from which the global colour distribution of the table is estimated
+SMOOTHNESS = 3.0  # weight of all neighbours of the same colour together, relative to the unary cost
+MIN_SMOOTHNESS = 0.1  # added to the colour similarity of a neighbour
+CORE_QUANTILE = 0.67  # quantile of the distance to the boundary above which a thin object's colours are trusted
+FORBIDDEN = 1e3  # cost of an excluded label
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class BoundaryRegion:
 
     points: Float[Tensor, "m 3"]
     lab: Float[Tensor, "m 3"]  # colours, CIELAB
-    ids: Int[Tensor, "m"]  # current labels, 0 the table
+    ids: Int[Tensor, "m"]  # current labels; 0: the table
     heights: Float[Tensor, "m"]  # above the table [HEIGHT_RESOLUTION]
-    even: Bool[Tensor, "m"]  # within the support tolerance of the table
+    even: Bool[Tensor, "m"]  # whether the height is within the tolerance of the support
     gap: Float[Tensor, "m"]  # distance to the nearest boundary [BOUNDARY_WIDTH]
     margin: float  # BOUNDARY_WIDTH [scene units]
 
     @classmethod
     def of(cls, g: Gaussians, lab: Float[Tensor, "n 3"], support: Support) -> BoundaryRegion:
-        """For Gaussians that are all near objects."""
+        """The region of the Gaussians `g`, which must all be near objects."""
         heights = support.heights(g.means)
         margin, level = BOUNDARY_WIDTH * support.view.radius, HEIGHT_RESOLUTION * support.view.radius
         even = heights.abs() < support.tolerance
@@ -56,15 +56,16 @@ class BoundaryRegion:
 
 
 def refine_boundaries(scene: Scene, support: Support) -> Gaussians:
-    """The Gaussians, with those near a boundary, or low enough to be table, relabelled as object or as table.
+    """Relabel the Gaussians near a boundary, or low enough to be table, as object or as table.
 
-    Next to objects, a reconstruction lifts parts of the table, which grouping assigns to the object, or the reverse.
-    Labels away from boundaries are kept and provide the colour distributions of object and table. Gaussians that no
-    photo shows keep their labels, and no Gaussian changes from one object to another. Without cameras nothing changes.
+    Next to objects, a reconstruction lifts parts of the table, which grouping then assigns to the object, or the other
+    way round. Labels away from boundaries are kept, and provide the colour distributions of object and table. Gaussians
+    that no photo shows keep their labels, and no Gaussian changes from one object to another. Without cameras nothing
+    changes.
 
-    Labels minimise a conditional random field over nearest neighbours by mean-field inference, as in Kraehenbuehl and
-    Koltun 2011, "Efficient inference in fully connected CRFs", eq. 4-6; as in Rother, Kolmogorov and Blake 2004,
-    "GrabCut", colour distributions are estimated again in each round from the labels of the previous one.
+    The labels minimise the energy of a conditional random field over nearest neighbours by mean-field inference
+    (Kraehenbuehl and Koltun 2011, "Efficient inference in fully connected CRFs", eq. 4-6). The colour distributions are
+    re-estimated in each round from the labels of the previous one (Rother, Kolmogorov and Blake 2004, "GrabCut").
     """
     g = scene.gaussians
     if scene.cameras is None or not len(scene.cameras):
@@ -83,7 +84,7 @@ def refine_boundaries(scene: Scene, support: Support) -> Gaussians:
 
 
 def _around(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], radius: float) -> Int[Tensor, "m"]:
-    """Indices of Gaussians of objects, or within `radius` of one."""
+    """Indices of the Gaussians of objects, or within `radius` of one [scene units]."""
     finite = means.isfinite().all(1)
     out = (ids > 0) & finite
     taken = means[out]
@@ -95,7 +96,7 @@ def _around(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], radius: float) -
 
 
 def _gap(points: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Distance from each Gaussian to the MIN_BOUNDARY_NEIGHBOURS-th nearest of another label."""
+    """Distance from each Gaussian to the MIN_BOUNDARY_NEIGHBOURS-th nearest Gaussian with another label."""
     gap = torch.full((len(points),), torch.inf)
     for label in ids.unique().tolist():
         own = ids == label
@@ -122,14 +123,14 @@ def _mean_field(near: BoundaryRegion, border: Int[Tensor, "b"], low: Bool[Tensor
 
 
 def _cost(near: BoundaryRegion, border: Int[Tensor, "b"], label: int) -> Float[Tensor, "b"]:
-    """Unary cost of a label for each boundary Gaussian: its negative log likelihood by height and colour."""
+    """Unary cost of a label for each boundary Gaussian: the negative log likelihood of its height and colour."""
     own, h = near.ids == label, near.heights[border]
     if label == 0:
         height, certain = 0.5 * (h.clamp_min(0) / TABLE_HEIGHT_SIGMA) ** 2, own & (near.gap > 1) & near.even
     else:
         own = own & (near.heights >= 1)
         height, certain = 0.5 * ((h - 1).clamp_max(0) / OBJECT_HEIGHT_SIGMA) ** 2, own
-        if own.any():  # all of a thin object is near a boundary
+        if own.any():  # a thin object may lie entirely within BOUNDARY_WIDTH of a boundary
             certain = own & (near.gap > min(1.0, float(near.gap[own].quantile(CORE_QUANTILE))))
     core = torch.nonzero(certain)[:, 0]
     if not len(core):
@@ -144,5 +145,5 @@ def _cost(near: BoundaryRegion, border: Int[Tensor, "b"], label: int) -> Float[T
 
 
 def _similarity(a: Float[Tensor, "b 3"], b: Float[Tensor, "c k 3"]) -> Float[Tensor, "b k"]:
-    """Gaussian similarity of colours, 1 where equal."""
+    """Similarity of colours by a Gaussian kernel; 1 if equal."""
     return (-0.5 * ((a[:, None] - b).norm(dim=2) / COLOUR_SIGMA) ** 2).exp()

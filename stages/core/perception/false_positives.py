@@ -1,4 +1,4 @@
-"""Removal of false positives: texture of the table that was labelled as objects."""
+"""Remove false positives: texture of the table that was labelled as an object."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 
 TABLE_NEIGHBOURS = 8  # Gaussians of the table that each Gaussian of an object is compared with
-MAX_LEVEL_FRACTION = 0.65  # fraction of an object that is level with nearby table; above it, it is texture
+MAX_LEVEL_FRACTION = 0.65  # fraction of an object level with the table next to it, above which the object is texture
 
 
 def remove_false_positives(scene: Scene, support: Support) -> Gaussians:
-    """The scene's Gaussians, with objects relabelled as background that are level with the table around them.
+    """The scene's Gaussians, with objects that are level with the surrounding table relabelled as background.
 
     A real object is higher than the visible table next to it, or has an interior far from any visible table. Stripes
     and threads of a tablecloth, which grouping finds by their colour, have neither property.

@@ -1,4 +1,4 @@
-"""The pixels of an object by its colours: GrabCut (Rother, Kolmogorov and Blake 2004), in OpenCV."""
+"""Segment an object in an image by colour: GrabCut (Rother, Kolmogorov and Blake 2004), in OpenCV."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_fill_holes
 
-MIN_PIECE_FRACTION = 0.1  # area of a connected piece of a mask, relative to the largest
+MIN_PIECE_FRACTION = 0.1  # least area of a connected piece of a mask, relative to the largest
 
 
 def grabcut(
     image: UInt8[np.ndarray, "h w 3"], unlikely: Bool[np.ndarray, "h w"], likely: Bool[np.ndarray, "h w"],
     sure: Bool[np.ndarray, "h w"], seed: int,
 ) -> Bool[np.ndarray, "h w"]:  # fmt: skip
-    """The object's pixels by GrabCut; pixels neither likely, unlikely nor sure are background."""
+    """The object's pixels by GrabCut; pixels that are neither unlikely, likely nor sure are background."""
     trimap = np.full(likely.shape, cv2.GC_BGD, dtype=np.uint8)
     trimap[unlikely], trimap[likely], trimap[sure] = cv2.GC_PR_BGD, cv2.GC_PR_FGD, cv2.GC_FGD
     if ((trimap == cv2.GC_BGD) | (trimap == cv2.GC_PR_BGD)).any() and (likely | sure).any():
@@ -25,7 +25,7 @@ def grabcut(
 
 
 def clean_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask without small separate pieces and small holes."""
+    """The mask without small separate pieces and without small holes."""
     _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = np.where(np.arange(len(stats)) > 0, stats[:, cv2.CC_STAT_AREA], 0)
     kept = (areas >= MIN_PIECE_FRACTION * areas.max())[piece] & mask

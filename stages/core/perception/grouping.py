@@ -1,4 +1,4 @@
-"""Grouping of Gaussians into movable objects by position, colour and normals, without labels or networks."""
+"""Group Gaussians into movable objects by position, colour and normals, without labels or networks."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 MAX_VOXELS = 60_000
-MIN_VOXEL_DENSITY = 0.3  # Gaussians per voxel of an object, relative to the median near the focus; less are floaters
+MIN_VOXEL_DENSITY = 0.3  # least Gaussians per voxel of an object [median near the focus]; sparser ones are floaters
 MAX_BASE_HEIGHT = 0.4  # largest height above the table of an object's lowest point [camera distance]
-MAX_BUMP_HEIGHT = 0.05  # height up to which a region of the table's colour is unevenness of the table [camera distance]
+MAX_BUMP_HEIGHT = 0.05  # height up to which a region of the table's colour is a bump of the table [camera distance]
 MAX_TABLE_OBJECT = 0.4  # longest side of an object on a table [camera distance]
 MAX_WALL_OBJECT = 0.9  # longest side of an object on a wall, which often fills the photos [camera distance]
-MIN_GAUSSIANS_ABOVE = 20  # above the plane, or there are no objects
+MIN_GAUSSIANS_ABOVE = 20  # least Gaussians above the plane; with fewer there are no objects
 
 
 def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:  # noqa: B008 -- frozen
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged
-    by similarity. Objects mostly outside the table become background. In a scene with a wall and no floor, objects
-    on the wall are found in the same way.
+    The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged by
+    similarity. Objects that are mostly outside the table become background. In a scene with a wall and no floor,
+    objects on the wall are found in the same way.
     """
     view = view_extent(scene)
     wall = find_wall(scene, view, grouping.seed)
@@ -103,8 +103,8 @@ def _candidates(g: Gaussians, view: ViewExtent, support: Support | None) -> Int[
 def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tuple[Tensor, Tensor]:
     """For Gaussians close to the table: whether they have its colour, and whether they belong to a flat object on it.
 
-    A flat object differs from the surrounding table in colour and is slightly higher. A stain differs only in
-    colour, a bump of the reconstruction only in height.
+    A flat object differs from the surrounding table in colour and is slightly higher. A stain differs only in colour,
+    a bump of the reconstruction only in height. `h` is the height above the table [scene units].
     """
     like, flat = torch.zeros(2, len(g), dtype=torch.bool)
     near = (h.abs() < 2.5 * support.tolerance) & (g.opacities > SURFACE_OPACITY) & support.inside(g.means)
@@ -124,12 +124,12 @@ def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tup
 
 
 def _shortest(g: Gaussians) -> Float[Tensor, "n 3"]:
-    """Direction of each Gaussian's shortest axis: the normal of a flat one."""
+    """Direction of each Gaussian's shortest axis, which is the surface normal of a flat Gaussian."""
     return matrix(g.quats)[torch.arange(len(g)), :, g.scales.argmin(1)]
 
 
 def _is_dense(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m"]:
-    """Points whose neighbours are about as near as usual; the others are floaters."""
+    """Mask of points whose neighbours are about as near as usual; the others are floaters."""
     if len(points) < MIN_GAUSSIANS_ABOVE:
         return torch.ones(len(points), dtype=torch.bool)
     distance = knn(points, points, 9)[0][:, -1]
@@ -137,7 +137,7 @@ def _is_dense(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m
 
 
 def _voxels(g: Gaussians, view: ViewExtent, seen: Tensor | None) -> tuple[Voxels, np.ndarray]:
-    """Voxels about twice as coarse as the Gaussians, and the voxel of each Gaussian (-1: dropped as stray)."""
+    """Voxels about twice as coarse as the Gaussians' spacing, and the voxel of each Gaussian (-1: dropped as stray)."""
     spacing = float(knn(g.means, g.means, 4)[0][:, 1:].mean(1).median())
     size = min(max(2.0 * spacing, 0.007 * view.radius), 0.025 * view.radius)
     while True:
@@ -162,7 +162,7 @@ def _mean(values: Float[Tensor, "n *v"], owner: Int[Tensor, "n"], count: Int[Ten
 def _normals(
     g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: Tensor | None, view: ViewExtent
 ) -> Tensor:
-    """Voxel normals from the shortest axes of Gaussians and planes of neighbours, oriented towards the cameras."""
+    """Voxel normals from the shortest axes of the Gaussians and the planes through neighbours, facing the cameras."""
     lengths, axes = g.scales.sort(1).values, _shortest(g)
     flat = (1 - lengths[:, 0] / lengths[:, 1].clamp_min(1e-12)).clamp_min(0)
     axes = _mean(flat[:, None, None] * axes[:, :, None] * axes[:, None], owner, count)
@@ -174,7 +174,7 @@ def _normals(
     wide = points[knn(points, points, 64)[1]].mean(1)
     toward = (
         points - wide + 1e-3 * view.radius * torch.tensor([0.0, 0, 1])
-    )  # outwards is away from the surrounding points
+    )  # without cameras, outwards is away from the surrounding points
     if seen is not None:
         total = torch.zeros(len(count), 3).index_add_(0, owner, seen)
         toward = torch.where(total.norm(dim=1, keepdim=True) > 0, total, toward)
@@ -182,7 +182,10 @@ def _normals(
 
 
 def _expected_sparsity(voxels: Voxels, scene: Scene, view: ViewExtent) -> np.ndarray:
-    """Expected sparsity of Gaussians in each voxel: squared distance from the nearest camera [camera distance^2]."""
+    """Expected sparsity of Gaussians in each voxel: squared distance from the nearest camera [camera distance^2].
+
+    It is limited to 0.25 to 4, and 1 without cameras.
+    """
     if scene.cameras is None or not len(scene.cameras):
         return np.ones(len(voxels))
     distance, _ = knn(centres(scene.cameras.viewmats), torch.from_numpy(voxels.points).float(), 1)
@@ -192,7 +195,7 @@ def _expected_sparsity(voxels: Voxels, scene: Scene, view: ViewExtent) -> np.nda
 def _remove_table_regions(
     voxels: Voxels, labels: np.ndarray, table: Float[Tensor, "bx by 3"], support: Support
 ) -> np.ndarray:
-    """Labels with regions of the table set to -1: low, and of its colour, or similar under a larger object."""
+    """The labels, with -1 for low regions of the table's colour; beneath a larger region, a similar colour suffices."""
     points = torch.from_numpy(voxels.points).float()
     h = support.heights(points).numpy() / support.view.radius
     around = table[tuple((support.cells(points) // 3).T)].numpy()
@@ -221,7 +224,7 @@ def _objects(
 ) -> np.ndarray:
     """Object number of each voxel, 1 for the largest; 0 for regions too small, too large, too sparse or off the table.
 
-    `count` is the number of Gaussians in each voxel, which is about 1 in a cloud of floaters.
+    `count` is the number of Gaussians in each voxel, scaled by the expected sparsity; it is low in clouds of floaters.
     """
     points = torch.from_numpy(voxels.points).float()
     off = np.zeros(len(voxels), bool)
@@ -248,7 +251,7 @@ def _objects(
 
 
 def name_objects(scene: Scene, support: Support | None) -> Scene:
-    """The scene with its objects renumbered by decreasing count of Gaussians, and default names."""
+    """The scene with its objects renumbered by decreasing number of Gaussians, and with default names."""
     g = scene.gaussians
     counts = torch.bincount(g.object_id)
     order = [i for i in counts.argsort(descending=True, stable=True).tolist() if i > 0 and counts[i] > 0]

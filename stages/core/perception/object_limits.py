@@ -1,4 +1,4 @@
-"""What counts as an object, and the parameters of grouping; imports nothing heavy, as options of commands have them."""
+"""Limits of what counts as an object, and parameters of grouping. Light to import, since command options use them."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ class ObjectLimits:
     """What counts as an object."""
 
     max_objects: int = 24
-    min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
+    min_size: float = 0.03  # least longest side of an object [distance of the cameras from what they look at]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ COLOURS = {
 
 
 def object_names(g: Gaussians, support: Support | None) -> list[str]:
-    """One name for each object 1, 2, ...: "yellow_object", "flat_black_object"; numbered where names repeat."""
+    """One name for each object 1, 2, ...: "yellow_object", "flat_black_object"; numbered if names repeat."""
     names = [_name(g[g.object_id == i], support) for i in range(1, int(g.object_id.max()) + 1)]
     total, seen = Counter(names), Counter()
     for index, name in enumerate(names):
@@ -40,7 +40,7 @@ def _name(g: Gaussians, support: Support | None) -> str:
 
 
 def _colour(g: Gaussians) -> str:
-    """The basic colour that the largest part of the surface area is nearest to."""
+    """The basic colour that is nearest to the largest part of the surface area."""
     rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
     lab = _lab(rgb.numpy())
     base = _lab(np.array(list(COLOURS.values()), np.float32))

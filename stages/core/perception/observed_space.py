@@ -1,4 +1,4 @@
-"""Observed space: points that rays of the cameras passed through, and points on observed surfaces."""
+"""Observed space: which points camera rays passed through, and which lie on observed surfaces, from depth maps."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
 
 FAR = 1e9  # depth of pixels without a surface
-MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # of pixels with a surface, and without one; others are unknown
-MAX_HIDDEN_WEIGHT = 0.3  # in any view, of a Gaussian that no camera sees [px of the downscaled images]
-MIN_VIEWS_FOR_TWO = 6  # cameras from which on two must agree that a point is free
+MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # least alpha of a surface, most alpha of an empty pixel; else unknown
+MAX_HIDDEN_WEIGHT = 0.3  # largest weight in any view of a Gaussian that counts as hidden [px of the downscaled images]
+MIN_VIEWS_FOR_TWO = 6  # least number of cameras for which two must agree that a point is free
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class ObservedSpace:
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
-    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views
-    device: str = "cpu"  # that renders; the maps are on the CPU
+    weight: Float[Tensor, "n"]  # largest weight of each Gaussian over the views [px]; empty without views
+    device: str = "cpu"  # on which views are rendered; the maps are on the CPU
 
     @staticmethod
     @torch.no_grad()
@@ -48,9 +48,9 @@ class ObservedSpace:
         return ObservedSpace(views, maps, weight.cpu(), device)
 
     def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
-        """Points more than `margin` in front of the surface in the depth map of a camera.
+        """Mask of points more than `margin` in front of the surface in the depth map of a camera [scene units].
 
-        With MIN_VIEWS_FOR_TWO cameras or more two must agree, since a floater may corrupt one depth map.
+        With MIN_VIEWS_FOR_TWO cameras or more, two must agree, since a floater may corrupt one depth map.
         """
         count = torch.zeros(len(points), dtype=torch.int64)
         for inside, z, depth in self.surface_depths(points):
@@ -58,7 +58,7 @@ class ObservedSpace:
         return count >= (2 if len(self.views) >= MIN_VIEWS_FOR_TWO else 1)
 
     def visible_fraction(self, points: Float[Tensor, "n 3"], margin: float) -> Float[Tensor, "n"]:
-        """Fraction of the cameras with a point in their image that see it: no surface is `margin` in front of it."""
+        """Fraction of the cameras with a point in their image that see it: no surface is `margin` or more before it."""
         seen, framed = torch.zeros(len(points)), torch.zeros(len(points))
         for inside, z, depth in self.surface_depths(points):
             framed += inside
@@ -77,10 +77,10 @@ class ObservedSpace:
     def is_hidden(
         self, scene: Gaussians, added: Gaussians, max_weight: float = MAX_HIDDEN_WEIGHT, max_leak: float = 0.1
     ) -> Bool[Tensor, "m"]:
-        """Which Gaussians could be added to the scene with almost no change of its images.
+        """Mask of the `added` Gaussians that could be added to the scene with almost no change of its images.
 
-        In each view, the weight of one must not exceed `max_weight` [px of the downscaled images], or `max_leak` times
-        its unoccluded weight, since a large disc behind a slightly transparent surface has some weight.
+        In each view, a Gaussian's weight must not exceed the larger of `max_weight` [px of the downscaled images] and
+        `max_leak` times its unoccluded weight: a large disc behind a slightly transparent surface has some weight.
         """
         joint, added = concatenate([scene, added]).to(self.device), added.to(self.device)
         keep = torch.ones(len(added), dtype=torch.bool, device=self.device)
@@ -93,7 +93,7 @@ class ObservedSpace:
 
 @torch.no_grad()
 def object_psnr(before: Scene, after: Scene, max_views: int = 4, device: str = "cpu") -> float | None:
-    """PSNR [dB] between two states of a scene in the pixels of objects, over `max_views` cameras; None without any."""
+    """PSNR [dB] between two states of a scene over the pixels of objects in at most `max_views` views, or None."""
     if before.cameras is None or not len(before.cameras):
         return None
     error = count = 0.0

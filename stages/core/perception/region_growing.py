@@ -1,4 +1,4 @@
-"""Region growing: extends the labels of objects to the remaining Gaussians that belong to them."""
+"""Region growing: extend the labels of objects to the remaining Gaussians that belong to them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from stages.core.geometry.rotations import matrix
 from stages.core.perception.support import Support, cell_medians, sliding_quantile
 from stages.core.scene.gaussians import Gaussians
 
-MIN_TABLE_DIFFERENCE = 12.0  # colour difference from the table from which a Gaussian is not the table [CIELAB]
-MIN_CHROMA_DIFFERENCE = 20.0  # difference in a and b that shading cannot cause [CIELAB]
-MAX_GROWTH_STEPS = 12  # steps of `radius` that an object may grow along Gaussians near the table
+MIN_TABLE_DIFFERENCE = 12.0  # colour difference from the table above which a Gaussian is not table [CIELAB]
+MIN_CHROMA_DIFFERENCE = 20.0  # least difference in a and b that shading cannot cause [CIELAB]
+MAX_GROWTH_STEPS = 12  # most steps of `radius` by which an object grows along Gaussians near the table
 
 
 def cielab_colours(g: Gaussians) -> Float[Tensor, "n 3"]:
     """Base colours (degree 0 of the spherical harmonics) in CIELAB."""
     rgb = (g.sh[:, 0] * C0 + 0.5).nan_to_num(0.5).clamp(0, 1).numpy().astype(np.float32)
-    if not len(rgb):  # which OpenCV refuses
+    if not len(rgb):  # OpenCV rejects empty arrays
         return torch.zeros(0, 3)
     return torch.from_numpy(cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3))
 
@@ -37,7 +37,7 @@ def table_colour(g: Gaussians, support: Support) -> Float[Tensor, "bx by 3"]:
 
 
 def grow_objects(g: Gaussians, support: Support | None, radius: float) -> Gaussians:
-    """Gaussians with the labels of objects extended to their neighbours, and to unlabelled Gaussians inside them.
+    """Extend the labels of objects to neighbouring Gaussians, and to unlabelled Gaussians inside the objects.
 
     A Gaussian within `radius` [scene units] of an object takes its label; close to the table it does so only if its
     colour is nearer to the object's than to that of the surrounding table.
@@ -60,8 +60,8 @@ def _grow(
 ) -> Int[Tensor, "n"]:
     """Object ids after the labels of `front` have spread, step by step, to the `free` Gaussians."""
     ids, lab = g.object_id.clone(), cielab_colours(g)
-    source = lab.clone()  # colour of the object where its growth began, so that colours cannot drift over many steps
-    level = torch.full((len(free),), torch.inf)  # height in tolerances
+    source = lab.clone()  # object colour where the growth began, so that colours cannot drift over many steps
+    level = torch.full((len(free),), torch.inf)  # height above the table [support tolerances]
     to_table = torch.zeros(len(free))
     if support is not None:
         level = support.heights(g.means[free]) / support.tolerance
@@ -70,7 +70,7 @@ def _grow(
         vivid = (lab[free] - around)[:, 1:].norm(dim=1) > MIN_CHROMA_DIFFERENCE
         level = torch.where(
             vivid & (level.abs() < 0.5), 0.5, level
-        )  # too flat for its height to decide, but its hue does
+        )  # too flat for the height to decide, so the hue does
     left = level > -0.5
     for _ in range(MAX_GROWTH_STEPS):
         free, level, to_table = free[left], level[left], to_table[left]
@@ -84,17 +84,17 @@ def _grow(
         ids[front], source[front] = ids[nearest], source[nearest]
         left = (
             ~take & (level > 0.4) & (level < 1)
-        )  # beyond the radius, high Gaussians are other objects and flat ones are texture of the table
+        )  # beyond the radius, high Gaussians belong to other objects and flat ones to the table's texture
     return ids
 
 
 def _fill_hulls(
     g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], large: Bool[Tensor, "n"], support: Support | None
 ) -> Int[Tensor, "n"]:
-    """Object ids after `free` Gaussians inside an object's convex hull have been added to it, smallest object first.
+    """Object ids after the `free` Gaussians inside an object's convex hull are added to it, smallest object first.
 
-    The hull extends down to the plane if the object stands on it. A `large` Gaussian must be inside up to one
-    standard deviation along each direction.
+    The hull extends down to the support if the object stands on it. A `large` Gaussian must be inside up to one
+    standard deviation in every direction.
     """
     counts = torch.bincount(ids)
     for number in [i for i in counts.argsort(stable=True).tolist() if i > 0 and counts[i] >= 8]:

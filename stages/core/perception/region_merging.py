@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-TEXTURE_CONTRAST = 9.0  # colour difference of neighbouring voxels up to which it is texture [CIELAB]
-MAX_SAMPLE_POINTS = 150  # points of a region that are tested against convex hulls
+TEXTURE_CONTRAST = 9.0  # colour difference of neighbouring voxels up to which it counts as texture [CIELAB]
+MAX_SAMPLE_POINTS = 150  # most points of a region that are tested against convex hulls
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class VoxelEdges:
 
 
 def voxel_edges(voxels: Voxels, radius: float = 2.2, k: int = 12) -> VoxelEdges:
-    """Edges to the at most k neighbours of each voxel within `radius` voxel sides."""
+    """Edges from each voxel to at most k nearest neighbours within `radius` voxel sides."""
     if len(voxels) < 2:
         none = np.zeros(0, np.int64)
         return VoxelEdges(none, none, none.astype(float), none.astype(float))
@@ -53,7 +53,7 @@ def voxel_edges(voxels: Voxels, radius: float = 2.2, k: int = 12) -> VoxelEdges:
     step = voxels.points[j] - voxels.points[i]
     step /= np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12)
     slope_i, slope_j = (voxels.normals[i] * step).sum(1), (voxels.normals[j] * step).sum(1)
-    jump = np.sqrt((slope_i * slope_j).clip(0))  # both normals along the edge: one surface is behind the other
+    jump = np.sqrt((slope_i * slope_j).clip(0))  # large if both normals point along the edge: a depth discontinuity
     bend = (slope_i - slope_j) / 2 + (jump - 0.3).clip(0)
     return VoxelEdges(i, j, np.linalg.norm(voxels.lab[i] - voxels.lab[j], axis=1), bend)
 
@@ -78,8 +78,9 @@ def oversegment(
 ) -> np.ndarray:
     """Region number of each voxel: regions of homogeneous colour without concave edges.
 
-    Regions below `min_size` voxels are merged with a neighbour. No region exceeds `max_size` voxels, since a single
-    weak boundary edge would otherwise join two objects irreversibly.
+    Regions below `min_size` voxels are merged with a neighbour. No region exceeds `max_size` voxels, because otherwise
+    a single weak boundary edge would join two objects irreversibly. `k` sets the scale: a larger one gives larger
+    regions.
 
     Source: Felzenszwalb and Huttenlocher 2004, "Efficient graph-based image segmentation".
     """
@@ -104,12 +105,12 @@ def oversegment(
 class Region:
     """A region of voxels during merging."""
 
-    members: np.ndarray  # voxels
+    members: np.ndarray  # (v,) indices of its voxels
     colours: np.ndarray  # (c,) histogram over the palette, sums to 1
     sample: np.ndarray  # (s, 3) subset of its points
-    corners: np.ndarray  # (c, 3) of its convex hull
-    hull: np.ndarray | None  # (f, 4) outward planes of its convex hull
-    depth: float  # sum over the sample of the depth below the hull
+    corners: np.ndarray  # (c, 3) vertices of its convex hull, or all its points without one
+    hull: np.ndarray | None  # (f, 4) outward planes of its convex hull; None without volume
+    depth: float  # sum of the sample points' depths below the hull
 
 
 @dataclass
@@ -164,11 +165,11 @@ class RegionMerger:
     def separation(self, a: int, b: int) -> float:
         """Dissimilarity of two neighbouring regions; below `GroupingOptions.detail` they are merged.
 
-        It increases with a concave boundary, with a union less convex than its parts, with a narrow boundary, and
-        with different colours, which count less where the union is convex. It decreases where one region lies in the
-        convex hull of the other (the wheels of a car), and for regions smaller than `min_voxels`.
+        It is increased by a concave or narrow boundary, by a union that is less convex than its parts, and by different
+        colours, which have less weight if the union is convex. It is decreased if one region lies in the convex hull of
+        the other (the wheels of a car), and for regions smaller than `min_voxels`.
 
-        Where a lower bound, without the terms that need convex hulls, is above the limit, the bound is returned.
+        If a lower bound without the terms that need convex hulls is already above the limit, that bound is returned.
         """
         one, two, border = self.regions[a], self.regions[b], self.borders[a][b]
         small = min(len(one.members), len(two.members))
@@ -192,12 +193,12 @@ class RegionMerger:
         return value(within, self._hollow(one, two))
 
     def _too_large(self, one: Region, two: Region) -> float:
-        """Penalty 0..1 of a union that exceeds `max_extent`."""
+        """Penalty 0..1 for a union that exceeds `max_extent`."""
         corners = np.concatenate([one.corners, two.corners])
         return float(np.clip(np.ptp(corners, axis=0).max() / self.max_extent - 1, 0, 1))
 
     def _hollow(self, one: Region, two: Region) -> float:
-        """Mean depth of points in the hull of the union minus that in their own hulls, relative to the smaller size."""
+        """Mean depth of points in the hull of the union minus that in their own hull, over the size of the smaller."""
         both = np.concatenate([one.sample, two.sample])
         hull = _hull(np.concatenate([one.corners, two.corners]))
         if hull is None:
@@ -244,7 +245,7 @@ class RegionMerger:
 
 
 def _palette(lab: np.ndarray, count: int = 16) -> np.ndarray:
-    """Palette by farthest-point sampling of the colours present."""
+    """Palette (c, 3) of at most `count` colours, by farthest-point sampling of the colours present."""
     rows = lab[:: max(1, len(lab) // 2000)]
     chosen = [rows[np.argmin(np.linalg.norm(rows - np.median(rows, 0), axis=1))]]
     distance = np.linalg.norm(rows - chosen[0], axis=1)
@@ -255,14 +256,14 @@ def _palette(lab: np.ndarray, count: int = 16) -> np.ndarray:
 
 
 def _soft_bins(lab: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """Soft assignment of each voxel's colour to the palette."""
+    """Soft assignment (m, c) of each voxel's colour to the palette; rows sum to 1."""
     distance = np.linalg.norm(lab[:, None] - palette[None], axis=2)
     weight = np.exp(-0.5 * ((distance - distance.min(1, keepdims=True)) / 8) ** 2)
     return weight / weight.sum(1, keepdims=True)
 
 
 def _hull(points: np.ndarray) -> ConvexHull | None:
-    """Convex hull of the points; None where they have no volume."""
+    """Convex hull of the points; None if they span no volume."""
     if len(points) < 8:
         return None
     try:

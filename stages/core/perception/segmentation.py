@@ -1,4 +1,4 @@
-"""Geometric segmentation: grouping of Gaussians into objects, followed by three passes that repair the result."""
+"""Geometric segmentation: group Gaussians into objects, then repair the result in three passes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stages.core.scene.scene import Scene
 def segment_by_geometry(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:  # noqa: B008 -- frozen
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    Groups found on a supporting plane are repaired: parts of one body are merged, boundaries refined, and texture of
+    Objects found on a supporting plane are repaired: parts of one body are merged, boundaries refined, and texture of
     the table removed.
     """
     grouped = group_objects(scene, grouping)

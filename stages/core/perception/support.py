@@ -1,4 +1,4 @@
-"""The supporting surface of a scene: its height, its noise, and the region of it that exists."""
+"""Find the supporting surface of a scene: its shape, its noise, and its extent."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
 SEARCH_RADIUS = 1.5  # distance from the focus within which Gaussians are examined [camera distance]
-GRID_CELLS = 300  # side of the grid over the surface
-MAX_QUANTILE_POINTS = 100_000  # points that a quantile of distances is computed from
+GRID_CELLS = 300  # cells along a side of the grid over the surface
+MAX_QUANTILE_POINTS = 100_000  # most points that a quantile of distances is computed from
 
 
 @dataclass(frozen=True)
 class ViewExtent:
-    """The point that the cameras look at, and their distance from it, which is the unit of most thresholds."""
+    """The point that the cameras look at, and their distance from it, the unit of most thresholds (camera distance)."""
 
     focus: Float[Tensor, "3"]
     radius: float  # median distance of the cameras from the focus [scene units]
@@ -51,7 +51,7 @@ def view_extent(scene: Scene) -> ViewExtent:
 
 
 def evenly_spaced(values: Float[Tensor, "n"], count: int) -> Float[Tensor, "m"]:
-    """At most `count` of the sorted values, at evenly spaced ranks; all of them where there are no more."""
+    """At most `count` of the sorted values, at evenly spaced ranks; all values, unsorted, if there are no more."""
     if len(values) <= count:
         return values
     return values.sort().values[torch.linspace(0, len(values) - 1, count, dtype=torch.float64).round().long()]
@@ -72,28 +72,28 @@ def _focus(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
 
 @dataclass(frozen=True)
 class Support:
-    """A nearly level surface z = p(x, y) + relief with p of second degree, and the region of it that exists."""
+    """A nearly level surface z = p(x, y) + relief with a quadratic p, and its extent."""
 
     view: ViewExtent
     coefficients: Float[Tensor, "6"]  # of 1, x, y, x^2, xy, y^2 about the focus, in units of the camera distance
-    noise: float  # robust standard deviation of its Gaussians about it [scene units]
-    cell: float  # of the grid [scene units]
-    region: Bool[Tensor, "gx gy"]  # cells of table, visible or under objects; the grid is centred on the focus
-    relief: Float[Tensor, "gx gy"]  # large-scale deviation from p, of the table or of its reconstruction [scene units]
+    noise: float  # robust standard deviation of its Gaussians from it [scene units]
+    cell: float  # side of a grid cell [scene units]
+    region: Bool[Tensor, "gx gy"]  # cells of the table, visible or under objects; the grid is centred on the focus
+    relief: Float[Tensor, "gx gy"]  # large-scale deviation of the table, or its reconstruction, from p [scene units]
 
     @property
     def tolerance(self) -> float:
-        """Height up to which Gaussians are the surface itself [scene units]."""
+        """Height up to which Gaussians belong to the surface itself [scene units]."""
         return min(max(3 * self.noise, 0.004 * self.view.radius), 0.02 * self.view.radius)
 
     def heights(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Height above the surface [scene units]."""
+        """Heights of points above the surface [scene units]."""
         return points[:, 2] - self.surface(points)
 
     def surface(self, points: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
         """Height z of the surface at the x and y of points [scene units]."""
         xy = (points[:, :2] - self.view.focus[:2]) / self.view.radius
-        far = xy.norm(dim=1, keepdim=True).clamp_min(SEARCH_RADIUS) / SEARCH_RADIUS  # p is constant beyond the data
+        far = xy.norm(dim=1, keepdim=True).clamp_min(SEARCH_RADIUS) / SEARCH_RADIUS  # p is radially constant beyond it
         i, j = self.cells(points).unbind(1)
         return _terms(xy / far) @ self.coefficients + self.relief[i, j]
 
@@ -117,7 +117,7 @@ def _terms(xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 6"]:
 
 
 def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) -> Support | None:
-    """The surface at `scene.floor`, or else the largest level surface near the focus; None where there is none."""
+    """The surface at `scene.floor`, or else the largest level surface near the focus; None if there is none."""
     view = view or view_extent(scene)
     g, R = scene.gaussians, view.radius
     points = g.means[is_opaque(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < SEARCH_RADIUS * R)]
@@ -141,12 +141,12 @@ def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) ->
 
 
 def is_opaque(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
-    """Gaussians that are finite, opaque (above 0.1) and smaller than 0.2 `radius`."""
+    """Mask of Gaussians that are finite, opaque (opacity above 0.1) and smaller than 0.2 `radius`."""
     return g.means.isfinite().all(1) & (g.opacities > 0.1) & (g.scales.amax(1) < 0.2 * radius)
 
 
 def _level(points: Float[Tensor, "n 3"], view: ViewExtent, seed: int) -> float | None:
-    """Height of the level plane with most points near the focus, by RANSAC; None where it has less than 5 %."""
+    """Height of the level plane with the most inliers near the focus, by RANSAC; None if they are less than 5 %."""
     near = 1 / (1 + ((points - view.focus).norm(dim=1) / (0.5 * view.radius)) ** 4)
     found = ransac(points, 0.01 * view.radius, near, lambda normals: normals[:, 2] > 0.98, seed=seed)
     if found is None or float(near[found[1]].sum() / near.sum()) < 0.05:
@@ -156,10 +156,10 @@ def _level(points: Float[Tensor, "n 3"], view: ViewExtent, seed: int) -> float |
 
 
 def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) -> tuple[Tensor, float]:
-    """Second-degree surface by iteratively reweighted least squares with Tukey's biweight, and its noise.
+    """Fit a quadratic surface by iteratively reweighted least squares with Tukey's biweight; also return its noise.
 
-    Each patch of table has the same weight. A ridge penalty on the curvature keeps low objects, such as a keyboard,
-    from bending the surface.
+    Each patch of the table has the same weight, reduced far from the focus. A ridge penalty on the curvature keeps low
+    objects, such as a keyboard, from bending the surface.
     """
     R = view.radius
     local = (band - torch.cat([view.focus[:2], torch.tensor([floor])])) / R
@@ -185,9 +185,9 @@ def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) 
 
 
 def _spread(residual: Float[Tensor, "n"], weights: Float[Tensor, "n"], bin: float = 2.5e-4) -> float:
-    """Standard deviation of the peak of residuals near 0, from its half width at half maximum on the narrower side.
+    """Standard deviation of the peak of the residuals near 0, from its half width at half maximum on the narrower side.
 
-    Quantiles are not usable, since low objects on the surface are a large part of the residuals.
+    Quantiles are not usable, since a large fraction of the residuals belongs to low objects on the surface.
     """
     edges = np.arange(-0.04, 0.04 + bin, bin)
     height, _ = np.histogram(residual.numpy(), edges, weights=weights.numpy())
@@ -203,7 +203,7 @@ def _spread(residual: Float[Tensor, "n"], weights: Float[Tensor, "n"], bin: floa
 def cell_medians(
     support: Support, points: Float[Tensor, "n d"], values: Float[Tensor, "n v"], coarse: int = 1
 ) -> Float[Tensor, "gx gy v"]:
-    """Median of the values of the points in each cell, or in each block of `coarse` cells; nan in empty ones."""
+    """Median of the points' values in each cell, or in each block of `coarse` x `coarse` cells; nan in empty ones."""
     side = -(-len(support.region) // coarse)
     cell = (support.cells(points) // coarse) @ torch.tensor([side, 1])
     out = torch.full((side * side, values.shape[1]), torch.nan)
@@ -215,7 +215,7 @@ def cell_medians(
 
 
 def sliding_quantile(grid: Float[Tensor, "gx gy v"], radius: int, fraction: float = 0.5) -> Float[Tensor, "gx gy v"]:
-    """Quantile of the cells within `radius` cells of each cell, ignoring nan; empty windows take the nearest value."""
+    """Quantile over a window of `radius` cells around each cell, ignoring nan; empty windows take the nearest value."""
     side = 2 * radius + 1
     out = []
     for layer in grid.unbind(2):
@@ -232,7 +232,7 @@ def sliding_quantile(grid: Float[Tensor, "gx gy v"], radius: int, fraction: floa
 
 
 def _relief(bare: Support, band: Float[Tensor, "n 3"]) -> Float[Tensor, "gx gy"]:
-    """Large-scale relief: medians over windows a quarter of the camera distance wide, mostly free of objects."""
+    """Large-scale relief: quantiles over windows a quarter of the camera distance wide, mostly free of objects."""
     h = bare.heights(band)
     near = h.abs() < 0.025 * bare.view.radius
     if not near.any():
@@ -245,7 +245,7 @@ def _relief(bare: Support, band: Float[Tensor, "n 3"]) -> Float[Tensor, "gx gy"]
 
 
 def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
-    """Cells of the connected piece of surface in focus, closed over the objects that stand on it."""
+    """Cells of the connected piece of surface in focus, by morphological closing over the objects that stand on it."""
     on = band[bare.heights(band).abs() < bare.tolerance]
     count = np.zeros((GRID_CELLS, GRID_CELLS))
     np.add.at(count, tuple(bare.cells(on).T.numpy()), 1)
@@ -265,7 +265,7 @@ def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
 
 
 def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
-    """Morphological closing by a disc, as `ndimage.binary_closing`, but by distances: the radius costs no time."""
+    """Morphological closing by a disc, by distance transforms: its cost does not grow with the radius."""
     if not mask.any():
         return mask
     outside = np.pad(ndimage.distance_transform_edt(~mask) > radius, 1, constant_values=True)
@@ -273,7 +273,7 @@ def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def topples(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
-    """Whether a body falls over: the centroid of its points lies outside the convex hull of its base points."""
+    """Whether a body falls over: the centroid of its points lies outside the convex hull of its base points (x, y)."""
     try:
         hull = ConvexHull(base.double().numpy()).equations
     except (QhullError, ValueError):  # the base has no area

@@ -1,7 +1,8 @@
-"""The outline of the table that objects stand on: where cameras look past its edge, at what lies below.
+"""Outline of the table on which objects stand, from views that look past its edge at lower surfaces.
 
-Where no camera does, as where the photos end, the table goes on. The outline is convex: half-planes through the edges,
-in DIRECTIONS directions, so that a notch in a table counts as table; and objects that stand at its height are on it.
+Where no camera looks past the edge, for example where the photos end, the table is taken to continue. The outline is
+convex, an intersection of half-planes in DIRECTIONS directions, so a notch in a table counts as table. Objects that
+stand at the height of the table are inside the outline.
 """
 
 from __future__ import annotations
@@ -19,37 +20,37 @@ from stages.core.perception.support import Support, find_support
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-# Those up to MIN_KNOWN were chosen on kitchen, kermit, the desk and banana, whose carpet has no edge. Lengths are in
-# camera distances.
-MIN_DROP = 0.05  # from the table to what is seen past it, along the ray
-MIN_VIEWS = 3  # that know a cell
-STRIP, GAP, NEAR = 0.1, 0.01, 0.03  # width of the strip beyond an edge, its distance, and depth of the edge itself
-MIN_SEEN_PAST = 0.8  # of the known cells in the strip beyond an edge
-MIN_KNOWN = 0.25  # of the strip
+# Lengths are in camera distances. MIN_DROP to MIN_KNOWN were chosen on the scenes kitchen, kermit, the desk and banana,
+# whose carpet has no edge. A view knows a cell if its pixel shows the cell or a surface behind it.
+MIN_DROP = 0.05  # least distance along the ray from the table to a surface seen past it
+MIN_VIEWS = 3  # least views that must know a cell
+STRIP, GAP, NEAR = 0.1, 0.01, 0.03  # width of the strip beyond an edge, its distance from the edge, depth of the edge
+MIN_SEEN_PAST = 0.8  # fraction of the known cells in the strip past which cameras must look
+MIN_KNOWN = 0.25  # least fraction of known cells in the strip
 
-MIN_SHARE = 0.5  # of the views that know a cell must look past it
-DIRECTIONS = 72
-LOWEST = 0.1  # quantile of the heights seen past the table, at which the ground is; below are errors of few views
+MIN_SHARE = 0.5  # fraction of the views that know a cell above which cameras look past it
+DIRECTIONS = 72  # candidate normals of the edges, at equal angles
+LOWEST = 0.1  # quantile of the heights seen past the table that is the ground; lower heights are errors of few views
 
 
 @dataclass(frozen=True)
 class TableOutline:
-    """A convex region of the plane, the intersection of half-planes, and the ground beyond it, in scene units."""
+    """The table as an intersection of half-planes in x and y, and the ground beyond it, in scene units."""
 
-    normals: Float[np.ndarray, "k 2"]  # outwards
+    normals: Float[np.ndarray, "k 2"]  # outward
     offsets: Float[np.ndarray, "k"]  # normals @ xy <= offsets on the table
-    ground: float  # height of the lowest that cameras see past the table
+    ground: float  # height of the lowest surface that cameras see past the table
 
     def beyond(self, xy: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
-        """How far points are beyond the edge; negative on the table."""
+        """Signed distance of points beyond the edge; negative on the table."""
         return (xy[:, :2] @ self.normals.T - self.offsets).max(1)
 
 
 @cached_in_scene
 def table_outline(scene: Scene, device: str = "cpu") -> TableOutline | None:
-    """The outline of the table at the scene's floor; None where no edge is known, as without cameras.
+    """The outline of the table at the scene's floor; None if no edge is known, for example without cameras.
 
-    `device` renders the depth maps.
+    The depth maps are rendered on `device`.
     """
     if scene.floor is None or scene.cameras is None or len(scene.cameras) < MIN_VIEWS:
         return None
@@ -71,7 +72,7 @@ def table_outline(scene: Scene, device: str = "cpu") -> TableOutline | None:
 
 
 def _bases(scene: Scene, support: Support) -> np.ndarray:
-    """Cells (m, 2) of the Gaussians at the height of the table of the objects that do not reach far below it."""
+    """Cells (m, 2) of the Gaussians at table height that belong to objects which do not reach far below the table."""
     cells = [torch.zeros(0, 2, dtype=torch.int64)]
     for o in scene.objects:
         means = scene.gaussians.means[scene.gaussians.object_id == o.id]
@@ -84,8 +85,10 @@ def _bases(scene: Scene, support: Support) -> np.ndarray:
 def _seen_past(
     support: Support, observed: ObservedSpace
 ) -> tuple[Bool[np.ndarray, "g g"], Bool[np.ndarray, "g g"], Float[np.ndarray, "h"]]:
-    """The cells of the support's grid past which most views look, those that enough views know, and the heights of the
-    surfaces that are seen past the former [scene units].
+    """Find where cameras look past the table.
+
+    Returns masks over the support's grid of the cells past which most views look, and of those that enough views know,
+    and the heights of the surfaces seen past the former [scene units].
     """
     side, drop = len(support.region), MIN_DROP * support.view.radius
     along = (torch.arange(side) + 0.5 - side / 2) * support.cell
@@ -109,8 +112,9 @@ def _seen_past(
 def _edges(
     table: np.ndarray, bases: np.ndarray, past: np.ndarray, known: np.ndarray, unit: float
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Outward normals and offsets of the edges of the cells `table` (m, 2) and `bases` (n, 2), in cells; `unit` is one
-    camera distance.
+    """Outward normals and offsets [cells] of the known edges around the cells `table` (m, 2) and `bases` (n, 2).
+
+    `past` and `known` are the masks of `_seen_past`; `unit` is the camera distance [cells].
     """
     edges = []
     for angle in np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False):

@@ -1,4 +1,4 @@
-"""Outlines of objects by their colours in the views, where a reconstruction spreads them over what is beside them."""
+"""Refine the outlines of objects by colour in the views: reconstructions spread objects over their surroundings."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from stages.core.perception.voting import ViewFootprint, add_votes, damp_votes, 
 from stages.core.raster.rasterise import rasterise_features
 from stages.core.scene.scene import Scene
 
-MAX_VIEWS = 16  # evenly chosen among the cameras
-BAND = 0.01  # distance from the outline so far within which the new one is looked for [camera distance]
-MIN_VOTES = 1.0  # of a Gaussian that changes its object; those hidden under something have less
-CONTEXT = 3.0  # width of the surroundings whose colours are compared with those of an object [BAND]
-REACH = 0.03  # of the Gaussians that an object may gain from those that it had [camera distance]
-MIN_PIXELS = 40  # of an object in a view
-MIN_KEPT = 0.4  # share of an object's pixels; where less is left, its colours are those of its surroundings
+MAX_VIEWS = 16  # most views used, evenly spaced among the cameras
+BAND = 0.01  # distance from the current outline within which the new one is searched [camera distance]
+MIN_VOTES = 1.0  # least votes of a Gaussian that changes its object; hidden Gaussians have fewer
+CONTEXT = 3.0  # width of the surroundings with which an object's colours are compared [BAND]
+REACH = 0.03  # largest distance of a Gaussian that an object gains from its previous Gaussians [camera distance]
+MIN_PIXELS = 40  # least pixels of an object in a view for its outline to be refined
+MIN_KEPT = 0.4  # least fraction of its pixels that an object keeps; if fewer remain, colour does not separate it
 
 
 def refine_outlines(
     scene: Scene, ids: Int[Tensor, "n"], seed: int = 0, device: torch.device | str = "cpu"
 ) -> Int[Tensor, "n"]:
-    """The objects `ids` of the Gaussians, with their outlines cut in each view by colour and voted over the views.
+    """Refine the object ids of the Gaussians: segment the outlines by colour in each view, and vote over the views.
 
-    The pixels within BAND of an object's outline are assigned anew by GrabCut; those farther inside and outside are
-    the examples of its colours and of those around it. Gaussians that hardly any view shows keep their object, and
-    without cameras all do. The views are drawn on `device`.
+    GrabCut reassigns the pixels within BAND of an object's outline; pixels farther inside and outside are the samples
+    of the object's colours and of its surroundings. Gaussians that hardly any view shows keep their object; without
+    cameras all of them do. The views are rendered on `device`.
     """
     if scene.cameras is None or not len(scene.cameras) or not bool((ids > 0).any()):
         return ids
@@ -56,7 +56,7 @@ def refine_outlines(
         for footprint, labels in found:
             votes = add_votes(votes, damp_votes(footprint.votes(torch.from_numpy(labels.result()))))
     voted = torch.where((votes.sum(1) >= MIN_VOTES).cpu(), votes.argmax(1).cpu(), ids)
-    for number in numbers:  # not what is far behind an object, where its surface is missing
+    for number in numbers:  # undo gains far behind an object, seen where its surface is missing
         gained = torch.nonzero((voted == number) & (ids != number))[:, 0]
         far = knn(means[ids == number], means[gained], 1)[0][:, 0] > REACH * radius
         voted[gained[far]] = ids[gained[far]]
@@ -64,9 +64,9 @@ def refine_outlines(
 
 
 def _label_image(scene: Scene, view: int, own: Float[Tensor, "n k"], numbers: list[int]) -> Int[np.ndarray, "h w"]:
-    """The object with the largest weight in each pixel at the resolution of voting; 0: the background.
+    """The object with the largest weight in each pixel at the voting resolution; 0: the background.
 
-    `own` is 1 for the Gaussians of each of the objects `numbers`.
+    Column k of `own` is 1 for the Gaussians of object `numbers[k]`, else 0.
     """
     width, height, K = voting_intrinsics(scene, view)
     weight = rasterise_features(scene.gaussians, own, scene.cameras.viewmats[[view]], K[None], width, height)[0]
@@ -75,7 +75,7 @@ def _label_image(scene: Scene, view: int, own: Float[Tensor, "n k"], numbers: li
 
 
 def _bands(scene: Scene, view: int, middles: Float[Tensor, "k 3"]) -> list[float]:
-    """BAND in pixels at the depth of each object's middle."""
+    """BAND at the depth of each object's middle [px]."""
     radius, focal = view_extent(scene).radius, voting_intrinsics(scene, view)[2][0, 0]
     return (BAND * radius * focal / depths(middles, scene.cameras.viewmats[view]).clamp_min(0.1 * radius)).tolist()
 
@@ -83,11 +83,11 @@ def _bands(scene: Scene, view: int, middles: Float[Tensor, "k 3"]) -> list[float
 def cut_outlines(
     image: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], bands: dict[int, float], seed: int
 ) -> Int[np.ndarray, "h w"]:
-    """The label image with new outlines of the objects of `bands`, each within that many pixels of the one before.
+    """The label image with new outlines of the objects in `bands`, each within that many pixels of its old outline.
 
-    Holes are filled: what is behind an object is seen beside it in other views, which outvote this one; the dark
-    screen of a monitor is not. No object takes pixels of another. Objects whose colours do not tell them from what is
-    around them stay as they are.
+    Holes are filled. If a hole shows the background, other views see that background beside the object and outvote this
+    one; a dark part of the object, such as the screen of a monitor, stays. No object takes pixels of another. An object
+    whose colours do not differ from its surroundings keeps its outline.
     """
     out = np.zeros_like(labels)
     for number, band in bands.items():

@@ -11,8 +11,8 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 
-MAX_VISIBILITY_SIDE = 320  # longest side of the images that visibility is rendered at [px]
-MAX_VISIBILITY_VIEWS = 24  # cameras that visibility is rendered for
+MAX_VISIBILITY_SIDE = 320  # longest side of the images in which visibility is rendered [px]
+MAX_VISIBILITY_VIEWS = 24  # most cameras for which visibility is rendered
 
 
 def downscaled_views(
@@ -32,8 +32,8 @@ def downscaled_views(
 def summed_view_directions(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
     """Sum over cameras of the unit direction to the camera times the Gaussian's weight in its image [px].
 
-    Zero where no camera sees the Gaussian. Its direction estimates the outer side of a surface, its length how much
-    of the Gaussian is visible.
+    Zero if no camera sees the Gaussian. The direction estimates the outer side of a surface, the length how much of the
+    Gaussian is visible.
     """
     toward = torch.zeros(len(g), 3)
     for viewmat, K, width, height in downscaled_views(cameras):

@@ -1,4 +1,4 @@
-"""Multi-view voting: label images of many views become one label per Gaussian, by majority, without outliers."""
+"""Multi-view voting: fuse the label images of many views into one label per Gaussian, by majority, without outliers."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
-MAX_VOTING_SIDE = 640  # longest side of the images that votes are counted in [px]
+MAX_VOTING_SIDE = 640  # longest side of the images in which votes are counted [px]
 POOLED_NEIGHBOURS = 8  # neighbours whose votes are added to those of a Gaussian
 SURFACE_TOLERANCE = 0.02  # distance from the rendered surface up to which a Gaussian is on it [fraction of its depth]
-MAX_SPACING = 3.0  # distance of neighbours that are used [median spacing]
-MAX_SPACING_POINTS = 20_000  # Gaussians that the median spacing is estimated from
+MAX_SPACING = 3.0  # largest distance of neighbours that are used [median spacing]
+MAX_SPACING_POINTS = 20_000  # most Gaussians from which the median spacing is estimated
 
 
 @dataclass(frozen=True)
 class ViewFootprint:
-    """Which of a scene's Gaussians are visible where in one view, at the resolution of voting."""
+    """Which Gaussians of a scene are visible at which pixels of one view, at the voting resolution."""
 
     front: Int[Tensor, "h w"]  # the Gaussian with the largest weight in each pixel; -1: none
     on: Int[Tensor, "m"]  # Gaussians whose centres lie on the rendered surface
@@ -55,8 +55,8 @@ class ViewFootprint:
     def votes(self, labels: Int[Tensor, "h2 w2"]) -> Float[Tensor, "n k"]:
         """Votes of a label image of any size: for each Gaussian and label, the weight of its pixels.
 
-        Each pixel votes for the Gaussian with the largest weight in it. Gaussians on the rendered surface also get a
-        vote of the pixel at their centre, with their summed weight.
+        Each pixel votes once for the Gaussian with the largest weight in it. A Gaussian on the rendered surface also
+        gets a vote from the pixel at its centre, with its weight summed over the image.
         """
         height, width = self.front.shape
         device = self.front.device
@@ -72,7 +72,7 @@ class ViewFootprint:
 
 
 def voting_intrinsics(scene: Scene, view: int) -> tuple[int, int, Float[Tensor, "3 3"]]:
-    """Width, height [px] and K of a view at the resolution of voting."""
+    """Width, height [px] and K of a view at the voting resolution."""
     width, height = scene.cameras.sizes[view].tolist()
     shrink = min(1.0, MAX_VOTING_SIDE / max(width, height))
     w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
@@ -93,14 +93,14 @@ def collect_votes(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]
 def damp_votes(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """One view's votes, scaled so that each Gaussian's total is the square root of its previous value.
 
-    Neighbouring pixels of a mask are not independent. This is between one vote per pixel, where one close view may
-    outvote all others, and one vote per view.
+    Neighbouring pixels of a mask are not independent. The square root is a compromise between one vote per pixel, where
+    a single close view may outvote all others, and one vote per view.
     """
     return votes / votes.sum(1, keepdim=True).clamp_min(1e-12).sqrt()
 
 
 def pool_votes(means: Float[Tensor, "n 3"], votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """Each Gaussian's votes plus those of its nearest neighbours, which reduces noise, since few pixels show each one.
+    """Each Gaussian's votes plus those of its nearest neighbours: this reduces noise, since few pixels show a Gaussian.
 
     Neighbours farther than MAX_SPACING are ignored. `ngff-lab bench segment` measures the effect with wrong masks.
     """
@@ -123,11 +123,11 @@ def apply_votes(
     scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0,
     numbers: Sequence[int] | None = None,
 ) -> Scene:  # fmt: skip
-    """The scene labelled by majority, labels grown to whole objects, with its objects.
+    """The scene with its objects, labelled by majority, with labels grown to whole objects.
 
-    `numbers` of the columns are the ids of the objects, by default 0, 1, 2 and so on. An object without a name becomes
-    object_NUMBER. `source` names the origin of the labels in messages. Raises InputError where the labels contain no
-    object.
+    `numbers` are the object ids of the columns of `votes`, by default 0, 1, 2 and so on. An object without a name is
+    called object_NUMBER. `source` names the origin of the labels in messages. Raises InputError if the labels contain
+    no object.
     """
     numbers = range(votes.shape[1]) if numbers is None else numbers
     if votes.shape[1] == 1:
@@ -145,9 +145,9 @@ def apply_votes(
 
 
 def majority_labels(scene: Scene, votes: Float[Tensor, "n k"]) -> Int[Tensor, "n"]:
-    """The label with most votes; ties and Gaussians without votes take the majority of the 5 nearest decided ones.
+    """The label with the most votes; Gaussians with a tie or without votes take the majority of the 5 nearest others.
 
-    Decided neighbours farther than MAX_SPACING times the median spacing are ignored.
+    Neighbours farther than MAX_SPACING times the median spacing are ignored.
     """
     best, ids = votes.max(1)
     second = votes.scatter(1, ids[:, None], 0).amax(1)

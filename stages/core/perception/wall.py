@@ -1,4 +1,4 @@
-"""Objects on a wall: the scene is rotated so that the wall becomes the floor, and processed like a table."""
+"""Objects on a wall: rotate the scene so that the wall becomes the floor and can be processed like a table."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from stages.core.perception.support import SEARCH_RADIUS, ViewExtent, is_opaque
 from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
 
-MIN_WALL_FRACTION = 0.2  # of the Gaussians in focus that lie on a wall
-MAX_BEHIND_FRACTION = 0.05  # of the Gaussians in focus that lie behind a wall
-MIN_EXTENT = 0.8  # of a wall, vertically as well as horizontally [camera distance]
-MAX_NORMAL_Z = 0.5  # |z| of a wall's unit normal; above it, the plane is a ramp
+MIN_WALL_FRACTION = 0.2  # least fraction of the Gaussians in focus that lie on a wall
+MAX_BEHIND_FRACTION = 0.05  # largest fraction of the Gaussians in focus that lie behind a wall
+MIN_EXTENT = 0.8  # least extent of a wall, both vertically and horizontally [camera distance]
+MAX_NORMAL_Z = 0.5  # largest |z| of a wall's unit normal; above it, the plane is a ramp
 WALL_THICKNESS = 0.02  # [camera distance]
 
 
 def find_wall(scene: Scene, view: ViewExtent, seed: int = 0) -> Similarity | None:
     """The rigid motion that turns the wall in view into a floor at z = 0.
 
-    A wall is the plane with most of the Gaussians in focus, if it is steep and large, all cameras are in front of
-    it, and almost nothing is behind it. None for scenes with a floor, and where there is no such plane.
+    A wall is the plane with the most Gaussians in focus, if it is steep and large, all cameras are in front of it, and
+    almost nothing is behind it. None for scenes with a floor or without such a plane.
     """
     if scene.floor is not None or scene.cameras is None or not len(scene.cameras):
         return None
@@ -57,7 +57,7 @@ def find_wall(scene: Scene, view: ViewExtent, seed: int = 0) -> Similarity | Non
 
 
 def _is_large(flat: Float[Tensor, "n 3"], radius: float) -> bool:
-    """Whether the central 90 % of a level plane's points extend far in x and in y."""
+    """Whether the central 90 % of a level plane's points extend over MIN_EXTENT in both x and y."""
     thinned = flat[:: max(1, len(flat) // 100_000), :2]
     return bool((thinned.quantile(0.95, dim=0) - thinned.quantile(0.05, dim=0)).min() > MIN_EXTENT * radius)
 

@@ -1,4 +1,4 @@
-"""Results that depend on a scene alone, computed once for each scene object."""
+"""Cache results that depend only on a scene in the scene object itself."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from functools import wraps
 
 
 class Results(dict):
-    """Results by function and arguments; a copy in another process starts without them."""
+    """Results by function and arguments. Pickling leaves them out, so a copy in another process starts without them."""
 
     def __reduce__(self) -> tuple:
         return Results, ()
 
 
 def cached_in_scene(function: Callable) -> Callable:
-    """A deterministic function of a scene, or its keypoints, and of hashable arguments that computes each result once.
+    """Decorate a deterministic function of a scene (or keypoints) and hashable arguments to compute each result once.
 
-    The scene object holds the results, so that they live as long as it does; a scene made by `replace` has none. Do not
-    change the scene or the results in place.
+    The scene object holds the results, so they live as long as it does; a scene made by `replace` starts without them.
+    Do not change the scene or the results in place.
     """
 
     @wraps(function)
     def call(scene, *args, **options):
-        held = scene.__dict__.setdefault("_cached", Results())  # apart from the fields, which are frozen
+        held = scene.__dict__.setdefault("_cached", Results())  # bypasses the frozen dataclass
         key = (function, args, tuple(sorted(options.items())))
         if key not in held:
             held[key] = function(scene, *args, **options)

@@ -1,4 +1,4 @@
-"""Pinhole cameras, the photos they were made from, and readers for the camera files of other tools."""
+"""Pinhole cameras, the intrinsics of the photos as taken, and readers for the camera files of other tools."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from stages.core.geometry.similarity import Similarity
 from stages.core.scene.colmap_model import read_colmap
 from stages.core.scene.schema import LARGEST, number, numbers, quote, read_json, reason
 
-LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
+LENS_MODEL = "opencv"  # the only lens model: k1 k2 p1 p2 k3 of OpenCV
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-MAX_SIDE = 65536  # of an image [px]
-PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # of transforms.json
+MAX_SIDE = 65536  # largest side of an image [px]
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # in transforms.json
 
 
 @dataclass(frozen=True)
 class PhotoIntrinsics:
-    """Intrinsics and lens of the photos as taken, of which the images of `Cameras` are undistorted views."""
+    """Intrinsics and lens distortion of the photos as taken; the images of `Cameras` are undistorted views of them."""
 
     Ks: Float[Tensor, "c 3 3"]  # [px] of the photo, pixel centres at +0.5
     sizes: Int[Tensor, "c 2"]  # width, height of the photo [px]
@@ -42,7 +42,7 @@ class Cameras:
     Ks: Float[Tensor, "c 3 3"]  # [px]
     sizes: Int[Tensor, "c 2"]  # width, height [px]
     names: tuple[str, ...]  # of the photos
-    photos: PhotoIntrinsics | None = None  # the photos as taken; None: they equal the views, up to their resolution
+    photos: PhotoIntrinsics | None = None  # the photos as taken; None: they equal the views, except for the resolution
 
     def __len__(self) -> int:
         return len(self.viewmats)
@@ -58,7 +58,7 @@ class Cameras:
 
 
 def check_cameras(cameras: Cameras) -> Cameras:
-    """The same cameras; ValueError, with the name of the first wrong one, unless they are rigid and finite."""
+    """Return the cameras. Raises ValueError, with the name of the first wrong one, unless all are rigid and finite."""
     V, R = cameras.viewmats.double(), cameras.viewmats[:, :3, :3].double()
     rigid = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().amax((1, 2)) < 1e-2
     rigid &= (torch.linalg.det(R) > 0) & ((V[:, 3] - V.new_tensor([0, 0, 0, 1])).abs().amax(1) < 1e-4)
@@ -86,7 +86,7 @@ def _check_intrinsics(names: Sequence[str], Ks: Float[Tensor, "c 3 3"], sizes: I
 
 
 def _check_each(names: Sequence[str], checks: dict[str, Bool[Tensor, "c"]]) -> None:
-    """ValueError with the name of the first camera that is not right, and what it has instead."""
+    """Raise ValueError with the name of the first camera that fails a check, and what is wrong with it."""
     for what, right in checks.items():
         if not right.all():
             raise ValueError(f"{quote(names[int((~right).nonzero()[0])])} has {what}")
@@ -141,7 +141,7 @@ def _intrinsics(rows: list[dict], labels: tuple[str, ...]) -> tuple[Float[Tensor
 
 
 def _matrix(values: list, shape: tuple[int, ...], label: str) -> Tensor:
-    """A float tensor; ValueError for another shape and for values that are not finite."""
+    """A float tensor of the values. Raises ValueError for another shape and for values that are not finite."""
     matrix = torch.tensor(values, dtype=torch.float32)
     if matrix.shape != shape:
         raise ValueError(f"{label} has shape {tuple(matrix.shape)}, not {shape}")
@@ -158,10 +158,10 @@ class LensDistortion:
 
 
 def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
-    """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras and images), sorted by name.
+    """Read the cameras of a nerfstudio transforms.json or a COLMAP model folder (cameras and images), sorted by name.
 
-    K and size are those of the photos as taken. Raises InputError for other files and for camera models with other
-    distortion parameters than OpenCV's first five, such as fisheye lenses.
+    K and size are those of the photos as taken. Raises InputError for other files, and for camera models with
+    distortion parameters beyond OpenCV's first five, such as fisheye lenses.
     """
     path = Path(path)
     if path.is_dir():
@@ -179,7 +179,7 @@ def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
 
 
 def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
-    """Cameras of a transforms.json; OpenGL axes (y up, view along -z) become OpenCV axes by negating y and z."""
+    """Cameras of a transforms.json; negating y and z turns OpenGL axes (y up, view along -z) into OpenCV axes."""
     viewmats, Ks, sizes, names, lenses = [], [], [], [], []
     for frame in sorted(data["frames"], key=lambda frame: frame["file_path"]):
         value = {**data, **frame}
@@ -197,7 +197,7 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
 
 
 def _transforms_lens(value: dict) -> list[float]:
-    """k1 k2 p1 p2 k3 of a frame; ValueError for another lens model."""
+    """k1 k2 p1 p2 k3 of a frame. Raises ValueError for another lens model."""
     model = value.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS or any(value.get(k, 0) for k in ("k4", "k5", "k6")):
         raise ValueError(f"camera_model {model} with k4 {value.get('k4', 0)}: only k1 k2 p1 p2 k3 are supported")

@@ -1,4 +1,4 @@
-"""The cameras and images of a COLMAP model (.bin or .txt); its points are not read.
+"""Read the cameras and images of a COLMAP model (.bin or .txt); its points are not read.
 
 Source of the layout: https://colmap.github.io/format.html and src/colmap/scene/reconstruction_io.cc of COLMAP.
 """
@@ -17,8 +17,8 @@ MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPE
           "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")  # fmt: skip
 FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
 LENS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8}
-MAX_NAME = 1000  # bytes
-MAX_TEXT = 1 << 30  # bytes
+MAX_NAME = 1000  # longest image name [bytes]
+MAX_TEXT = 1 << 30  # largest text file [bytes]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ColmapImage:
 def read_colmap(folder: Path) -> list[ColmapImage]:
     """The images of a COLMAP model with their cameras, sorted by name.
 
-    Raises ValueError for damaged files and for camera models other than those of FOCALS, and FileNotFoundError.
+    Raises ValueError for damaged files and for camera models that are not in FOCALS, and FileNotFoundError.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     cameras = _cameras_bin(folder / "cameras.bin") if binary else _cameras_txt(folder / "cameras.txt")
@@ -49,7 +49,7 @@ def read_colmap(folder: Path) -> list[ColmapImage]:
 
 
 class _Bytes:
-    """Sequential reader of packed little-endian values; ValueError at the end of the file."""
+    """Sequential reader of packed little-endian values. Raises ValueError for reads beyond the end of the file."""
 
     def __init__(self, path: Path):
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
@@ -62,7 +62,7 @@ class _Bytes:
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 
     def count(self, smallest: int) -> int:
-        """A number of rows of at least `smallest` bytes."""
+        """Read a number of rows, each of at least `smallest` bytes."""
         (n,) = self.take("Q")
         if n * smallest > len(self.data) - self.at:
             raise ValueError(f"{self.name} declares {n} rows, but has {len(self.data)} bytes")
@@ -90,7 +90,7 @@ def _images_bin(path: Path) -> list[tuple[str, tuple, int]]:
     for _ in range(file.count(65)):
         _, *pose, camera = file.take("I7dI")
         rows.append((file.text(), tuple(pose), camera))
-        features = file.count(24)  # x, y and the number of a point
+        features = file.count(24)  # x, y and point id of each feature
         file.at += 24 * features
     return rows
 
@@ -114,7 +114,7 @@ def _cameras_txt(path: Path) -> dict[int, tuple]:
 
 def _images_txt(path: Path) -> list[tuple[str, tuple, int]]:
     rows = []
-    for line in _lines(path)[::2]:  # every second line has the features, and may be empty
+    for line in _lines(path)[::2]:  # every second line lists the features, and may be empty
         words = line.split(maxsplit=9)
         if len(words) != 10:
             raise ValueError(f"{path.name} has the line {quote(line)}")
@@ -123,7 +123,7 @@ def _images_txt(path: Path) -> list[tuple[str, tuple, int]]:
 
 
 def _length(model: str) -> int:
-    """Number of parameters of a camera model; ValueError unless its lens can be undistorted."""
+    """Number of parameters of a camera model. Raises ValueError unless its lens can be undistorted."""
     if model not in FOCALS:
         raise ValueError(f"camera model {quote(model, 40)} is not supported; undistort it with `colmap "
                          "image_undistorter`")  # fmt: skip
@@ -131,7 +131,7 @@ def _length(model: str) -> int:
 
 
 def _camera(model: str, width: int, height: int, parameters: tuple[float, ...]) -> tuple:
-    """K, size and lens from the parameters f or fx fy, cx cy, then the lens."""
+    """K, size and lens from COLMAP's parameters: f or fx fy, then cx cy, then the lens."""
     f = FOCALS[model]
     focals, (cx, cy), lens = parameters[:f], parameters[f : f + 2], parameters[f + 2 :]
     if not all(-LARGEST <= x <= LARGEST for x in parameters):

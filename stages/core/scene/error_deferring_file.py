@@ -1,4 +1,4 @@
-"""A file object for h5py that defers write errors, such as a full disk: HDF5 crashes if a write raises an exception."""
+"""File object for h5py that defers write errors, such as a full disk: HDF5 crashes if a write raises an exception."""
 
 import io
 
@@ -6,8 +6,8 @@ import io
 class ErrorDeferringFile(io.FileIO):
     """A file that stores write errors in `error` instead of raising them.
 
-    Data that could not be written stay in memory and are read from there, since HDF5 also crashes if it reads back
-    other bytes than it wrote.
+    Data that could not be written stay in memory and are read from there, since HDF5 also crashes if it does not read
+    back the bytes that it wrote.
     """
 
     def __init__(self, *args):

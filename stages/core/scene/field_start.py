@@ -1,4 +1,4 @@
-"""The group `field` of a trajectory: initial conditions of the learned engine, from which a page can simulate."""
+"""Group `field` of a trajectory file: initial conditions of the learned engine, from which a page can simulate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.scene.h5_text import check_attributes
 from stages.core.scene.schema import number, numbers, quote, whole
 
 GROUP = "field"
-LARGE = 1e30
+LARGE = 1e30  # upper bound of masses, volumes, moduli and solidity
 DATASETS = {  # p keypoints, o objects
     "points": Dataset("p 3"),
     "mass_fraction": Dataset("p", low=0, high=1.001),
@@ -36,7 +36,7 @@ DATASETS = {  # p keypoints, o objects
 
 @dataclass(frozen=True)
 class UnitFactors:
-    """Factors from the units of the scene (lengths) and SI (others) to those of the learned model."""
+    """Factors from scene units (lengths) and SI units (other quantities) to the units of the learned model."""
 
     length: float  # model metres per scene unit
     scale: float  # model metres per metre
@@ -49,10 +49,10 @@ class FieldUnits(UnitFactors):
     """Unit conversion and time stepping of the learned model."""
 
     origin: tuple[float, float, float]  # scene point that becomes (0, 0, FLOOR) [scene units]
-    gravity: float  # downwards, in model units [m/s^2]
+    gravity: float  # downward acceleration in model units [m/s^2]
     steps: int  # time steps of the model per frame
     weights: str  # sha256 of the model's weights
-    friction: float | None = None  # of all objects, overrides the materials'
+    friction: float | None = None  # of all objects; overrides that of their materials
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class FieldStart:
     """Initial keypoints, rigid-body states and materials in model units; keypoints and objects in the file's order."""
 
     points: Float[Tensor, "p 3"]  # [m]
-    mass_fraction: Float[Tensor, "p"]  # of each keypoint: its part of the object's mass
+    mass_fraction: Float[Tensor, "p"]  # fraction of the object's mass at each keypoint
     mass: Float[Tensor, "o"]  # [kg]
-    volume: Float[Tensor, "o"]  # not in model units [m^3]
+    volume: Float[Tensor, "o"]  # in SI units, not model units [m^3]
     E: Float[Tensor, "o"]  # Young's modulus [Pa]
     solidity: Float[Tensor, "o"]  # stiffness relative to a hollow body
     nu: Float[Tensor, "o"]  # Poisson's ratio
@@ -77,7 +77,7 @@ class FieldStart:
 
 
 def write_field_start(file: h5py.File, start: FieldStart) -> None:
-    """Write the group; an existing one is replaced."""
+    """Write the group, replacing an existing one."""
     if GROUP in file:
         del file[GROUP]
     group = file.create_group(GROUP)
@@ -91,7 +91,7 @@ def write_field_start(file: h5py.File, start: FieldStart) -> None:
 
 
 def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | None:
-    """The group, or None where the file has none. Raises KeyError and ValueError for a damaged one."""
+    """Read the group; None if the file has none. Raises KeyError and ValueError for a damaged one."""
     if GROUP not in file:
         return None
     read = {name: dataset.read(file, f"{GROUP}/{name}", lengths) for name, dataset in DATASETS.items()}

@@ -17,18 +17,18 @@ from stages.core.errors import InputError
 from stages.core.scene.formats import format_of
 from stages.core.scene.schema import read_json, reason
 
-KEPT_OF_NAME = 50  # characters of a file's name in that of its temporary file; names have up to 255 bytes
+KEPT_OF_NAME = 50  # most characters of a file's name in the name of its temporary file; names have up to 255 bytes
 _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _count = itertools.count()
-_swept: set[Path] = set()  # folders in which this process has looked for files of killed processes
+_swept: set[Path] = set()  # folders from which this process has removed the files of killed processes
 
 
 def check_output(path: Path, *kinds: str) -> None:
-    """Whether a file can be written, to be said before long work: InputError where not.
+    """Check before long work that a file can be written. Raises InputError if it cannot.
 
-    Where `path` is a folder or a device, its folder is missing or cannot be written to, or its suffix is not of a
-    format that holds one of the `kinds` of data (formats.py), if any are given: the next stage could not read it, and
-    it might be a file of another kind.
+    That is if `path` is a folder or a device, if its folder is missing or cannot be written to, or if `kinds` of data
+    (formats.py) are given and the suffix is not of a format that holds one of them: the next stage could not read the
+    file, and an existing file of that name might be of another kind.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name the file to write")
@@ -43,7 +43,7 @@ def check_output(path: Path, *kinds: str) -> None:
 
 
 def make_folder(path: Path) -> Path:
-    """Create a folder to write to, with those above it; InputError, before long work, where that is not possible."""
+    """Create a folder to write to, with its parents. Raises InputError, before long work, if that is not possible."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -54,7 +54,7 @@ def make_folder(path: Path) -> Path:
 
 
 def check_json_output(path: Path) -> None:
-    """As `check_output`, for JSON: InputError for another suffix too, since it might be a file of another kind."""
+    """As `check_output`, for JSON. Raises InputError for another suffix too: it might be a file of another kind."""
     check_output(path)
     if path.suffix.lower() != ".json":
         raise InputError(f"{path}: the file to write is JSON; use the suffix .json")
@@ -62,12 +62,12 @@ def check_json_output(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.
+    """A temporary path next to `path`, with the same suffix, that replaces `path` on success and is deleted on failure.
 
-    Its name .part-HOST-PID-COUNT-NAME is unique: of several processes that write the same file, the last one wins.
-    Only the end of a long NAME is part of it, so that names may be as long as the file system allows.
-    The first call for a folder deletes what killed processes of this machine left there.
-    Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
+    Its name .part-HOST-PID-COUNT-NAME is unique: if several processes write the same file, the last one wins. Only the
+    end of a long NAME is used, so that names may be as long as the file system allows. The first call for a folder
+    deletes the temporary files that killed processes of this machine left there. Raises InputError if `path` is a
+    folder, its folder is missing, or the file cannot be written.
     """
     path = Path(path)
     check_output(path)
@@ -83,13 +83,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def save_tensors(path: Path, values: object) -> None:
-    """Write tensors, and containers of them, with torch.save; raises InputError as `replacing` does."""
+    """Write tensors, and containers of them, with torch.save. Raises InputError as `replacing` does."""
     import torch
 
-    with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
+    with replacing(path) as part, part.open("wb") as file:  # a full disk raises OSError only with a file object
         try:
             torch.save(values, file)
-        except RuntimeError as error:  # torch.save closes its archive after a failed write, which fails too
+        except RuntimeError as error:  # after a failed write, torch.save also fails to close its archive
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
 
@@ -109,13 +109,13 @@ def _is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # of another user
+    except PermissionError:  # the process of another user
         return True
     return True
 
 
 def must_exist(path: Path, what: str) -> Path:
-    """The path, if it is a readable, non-empty file; otherwise InputError, which says that `what` is expected."""
+    """The path, if it is a readable, non-empty file. Otherwise raises InputError, saying that `what` is expected."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; {what} is expected")
@@ -131,7 +131,7 @@ def must_exist(path: Path, what: str) -> Path:
 
 
 def read_json_file(path: Path, what: str, kind: type | tuple[type, ...] = dict) -> Any:
-    """The value of a JSON file, of type `kind`; InputError, which says that `what` is expected, for anything else."""
+    """The value of a JSON file, of type `kind`. Otherwise raises InputError, which says that `what` is expected."""
     must_exist(path, what)
     try:
         data = read_json(path)
@@ -149,7 +149,7 @@ def sha256(path: Path) -> str:
 
 
 def _digest(file) -> str:
-    """SHA-256 in blocks, as hashlib.file_digest (Python 3.11)."""
+    """SHA-256 in blocks, for Python before 3.11, which has no hashlib.file_digest."""
     digest = hashlib.sha256()
     while block := file.read(1 << 20):
         digest.update(block)
@@ -170,9 +170,9 @@ def seconds_since(began: float) -> dict[str, float]:
 
 
 def provenance(command: str, inputs: Sequence[Path], options: object = None) -> dict:
-    """Provenance of a file: command, version, options, and the inputs, with those that options name.
+    """Provenance of an output file: command, version, options, and the inputs, including paths given as options.
 
-    Files have their sha256; folders are there by name only.
+    Input files are recorded with their sha256, folders only by name.
     """
     chosen = asdict(options) if is_dataclass(options) else dict(options or {})
     paths = dict.fromkeys([*map(Path, inputs), *(v for v in chosen.values() if isinstance(v, Path))])

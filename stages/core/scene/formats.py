@@ -27,11 +27,11 @@ class Format(NamedTuple):
     writer: str = ""
 
     def read(self, path: Path) -> object:
-        """The contents of the file, of the type that readers of its kind return."""
+        """Read a file; the type of the result depends on the kind."""
         return load(self.reader)(path)
 
     def load_writer(self) -> Callable:
-        """The function or class that writes files of this format; only where there is one."""
+        """The function or class that writes files of this format, which must have a writer."""
         return load(self.writer)
 
 
@@ -61,8 +61,8 @@ def suffixes(*kinds: str, writable: bool = False) -> list[str]:
 def format_of(path: Path, *kinds: str, writable: bool = False) -> Format:
     """The format of a file by its suffix; the file need not exist.
 
-    Raises InputError, with the suffixes that are accepted, unless the format holds one of these kinds of data and,
-    with `writable`, can be written.
+    Raises InputError, which lists the accepted suffixes, unless the format holds one of these kinds of data and, with
+    `writable`, can be written.
     """
     suffix, allowed = path.suffix.lower(), suffixes(*kinds, writable=writable)
     if suffix not in allowed:

@@ -13,12 +13,12 @@ from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.rotations import multiply, quaternion
 from stages.core.geometry.similarity import Similarity
 
-SURFACE_OPACITY = 0.1  # Gaussians above it are part of a visible surface
+SURFACE_OPACITY = 0.1  # opacity above which Gaussians belong to a visible surface
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """3D Gaussians ready to use: activations applied, world frame (z up)."""
+    """3D Gaussians with activations applied, in the world frame (z up)."""
 
     means: Float[Tensor, "n 3"]  # [m]
     quats: Float[Tensor, "n 4"]  # unit, w x y z
@@ -35,12 +35,12 @@ class Gaussians:
         return Gaussians(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def to(self, device: str | torch.device) -> Gaussians:
-        """The same Gaussians on a device."""
+        """The Gaussians on a device."""
         return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All parts in order; lower SH degrees are padded with zeros to the highest."""
+    """Concatenate Gaussians in order; lower SH degrees are padded with zeros to the highest."""
     k = max(part.sh.shape[1] for part in parts)
     padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
     joined = {f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians) if f.name != "sh"}
@@ -48,7 +48,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def transformed(g: Gaussians, similarity: Similarity) -> Gaussians:
-    """Gaussians under a similarity transform, spherical harmonics rotated with them."""
+    """Apply a similarity transform to Gaussians, including their spherical harmonics."""
     R = similarity.rotation
     return replace(
         g, means=similarity(g.means), quats=multiply(quaternion(R).expand(len(g), 4), g.quats),

@@ -1,9 +1,9 @@
 """Multithreaded compression and decompression of HDF5 datasets; HDF5 itself uses one thread.
 
-The files are those that HDF5 writes with its filters shuffle (the first bytes of all values, then the second ones, and
-so on) and gzip: chunks are encoded and decoded here, and written and read unfiltered (direct chunk I/O). ISA-L
-compresses what is stored here some ten times as fast as zlib, to the same format. HDF5 unpacks any amount from a chunk,
-which may be a bomb; what is not decoded here is to be checked first.
+The files are the same as HDF5 writes with its filters shuffle (the first bytes of all values, then the second bytes,
+and so on) and gzip. Chunks are encoded and decoded here, and written and read with direct chunk I/O, which bypasses the
+filters. ISA-L compresses our data about ten times as fast as zlib, to the same format. HDF5 does not limit the size to
+which a chunk decompresses, which may be a decompression bomb, so chunks that HDF5 decodes must be checked first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from isal import isal_zlib
 
-LEVEL = 2  # of ISA-L, 0 to 3; what HDF5 itself compresses has zlib's level of this number
+LEVEL = 2  # compression level of ISA-L, 0 to 3, and of zlib where HDF5 itself compresses
 COMPRESSED = {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 CHUNK_BYTES = 1 << 18
 SHUFFLE, GZIP, CHECKSUM = h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32
@@ -36,21 +36,21 @@ def write_compressed(file: h5py.File, name: str, values: np.ndarray) -> None:
 
 
 def append_rows(data: h5py.Dataset, rows: np.ndarray) -> None:
-    """Append rows to a dataset that is COMPRESSED in chunks of one row."""
+    """Append rows to a dataset that was created with COMPRESSED and chunks of one row."""
     first = len(data)
     data.resize(first + len(rows), axis=0)
     _write_chunks(data, first, np.split(rows.astype(data.dtype, copy=False), len(rows)))
 
 
 def read_compressed(data: h5py.Dataset, row: int | None = None) -> np.ndarray:
-    """All values of a dataset, or of a row of one with several axes; OSError if a chunk is damaged."""
+    """All values of a dataset, or one row of a dataset with several axes. Raises OSError if a chunk is damaged."""
     if not decoded_here(data) or not data.size:
         return data[() if row is None else row]
     filters, chunks, dtype = filters_of(data), data.chunks, data.dtype
     first, rows = (0, len(data)) if row is None else (row, 1)
     out = np.full((rows, *data.shape[1:]), data.fillvalue, dtype)
 
-    # h5py is called from this thread only: with several threads its lock can deadlock (h5py issue 2920).
+    # h5py is called only from this thread, because its lock can deadlock with several threads (h5py issue 2920)
     def place(chunk: tuple[tuple[int, ...], list[int], bytes]) -> None:
         (above, *others), used, stored = chunk
         values = _decoded(stored, used, chunks, dtype)
@@ -71,9 +71,9 @@ def decoded_here(data: h5py.Dataset) -> bool:
 
 
 def check_chunks(data: h5py.Dataset) -> None:
-    """OSError if a chunk that HDF5 is to decode with gzip is damaged, or larger than its values.
+    """Raise OSError if a gzip chunk that HDF5 will decode is damaged, or decompresses to more than its values.
 
-    Not of strings of variable length, for which `h5_text.check_texts` is.
+    Variable-length strings are not checked here, but by `h5_text.check_texts`.
     """
     filters = filters_of(data)
     if GZIP not in filters or data.dtype.kind == "O":
@@ -81,7 +81,7 @@ def check_chunks(data: h5py.Dataset) -> None:
     size = int(np.prod(data.chunks)) * data.dtype.itemsize
     for info in chunks_of(data):
         used = used_filters(filters, info)
-        while used and used[-1] == CHECKSUM:  # four bytes after the others
+        while used and used[-1] == CHECKSUM:  # it only appends four bytes
             used.pop()
         if GZIP in used[:-1]:
             raise OSError("a chunk is compressed by other filters after gzip")
@@ -90,7 +90,7 @@ def check_chunks(data: h5py.Dataset) -> None:
 
 
 def chunks_of(data: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:
-    """Offset, place and size of the stored chunks of a dataset, in a time that is linear in their number."""
+    """Index, file offset and size of the stored chunks of a dataset, in time linear in their number."""
     found: list[h5py.h5d.StoreInfo] = []
     data.id.chunk_iter(found.append)
     return found
@@ -103,13 +103,13 @@ def _write_chunks(data: h5py.Dataset, first: int, chunks: list[np.ndarray]) -> N
 
 
 def _encoded(values: np.ndarray) -> bytes:
-    """A chunk as stored."""
+    """A chunk as stored in the file: shuffled and compressed."""
     shuffled = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
     return isal_zlib.compress(shuffled, LEVEL)
 
 
 def _decoded(stored: bytes, used: list[int], shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """The values of a chunk that is stored with some of shuffle and gzip; OSError if it is damaged."""
+    """Decode a chunk to which the filters `used` (shuffle, gzip) were applied. Raises OSError if it is damaged."""
     size = int(np.prod(shape)) * dtype.itemsize
     raw = _inflated(stored, size) if GZIP in used else stored
     if len(raw) != size:
@@ -121,7 +121,7 @@ def _decoded(stored: bytes, used: list[int], shape: tuple[int, ...], dtype: np.d
 
 
 def _inflated(stored: bytes, size: int) -> bytes:
-    """A chunk without gzip; OSError if it is damaged, or has more than `size` bytes then."""
+    """Decompress a chunk. Raises OSError if it is damaged, or decompresses to more than `size` bytes."""
     try:
         raw = isal_zlib.decompressobj().decompress(stored, size + 1)
     except isal_zlib.error as error:
@@ -138,12 +138,12 @@ def filters_of(data: h5py.Dataset) -> tuple[int, ...]:
 
 
 def used_filters(filters: tuple[int, ...], info: h5py.h5d.StoreInfo) -> list[int]:
-    """Those of a dataset's filters that are applied to a chunk."""
+    """The filters of a dataset that are applied to this chunk."""
     return [code for i, code in enumerate(filters) if not info.filter_mask >> i & 1]
 
 
 def _in_threads(function: Callable, items: Iterable) -> list[Any]:
-    """Results of a function for items, in order, by as many threads as PyTorch uses."""
+    """Map a function over items with as many threads as PyTorch uses; results are in order."""
     count = min(torch.get_num_threads(), len(items))
     if count <= 1:
         return [function(item) for item in items]

@@ -1,4 +1,4 @@
-"""Validation of HDF5 datasets; separate from schema.py, so that only readers of trajectories import h5py."""
+"""Checks of HDF5 datasets and attributes; separate from schema.py, so that only readers of trajectories import h5py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.scene.h5_chunks import READABLE, check_chunks, decoded_here, fi
 from stages.core.scene.h5_text import check_attributes, check_texts
 from stages.core.scene.schema import LARGEST, MAX_DEFLATE_RATIO, Bound, quote
 
-MAX_CHUNK = 64 << 20  # bytes of a chunk that are always accepted
+MAX_CHUNK = 64 << 20  # size up to which a chunk is accepted, however little the file stores [bytes]
 
 
 @contextmanager
@@ -27,10 +27,10 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 
 def find_link(file: h5py.File, name: str) -> h5py.HardLink | h5py.SoftLink | h5py.ExternalLink | None:
-    """The link of this name, or the first of its parents that is not a hard one; None where the file has none.
+    """The link of this name, or the first link on its path that is not a hard link; None if the file has none.
 
-    No link is followed, as h5py does in `name in file`: soft links may be cyclic, and external links may refer to any
-    file of the machine, or to a pipe, for which HDF5 waits.
+    Unlike `name in file`, this follows no links: soft links may be cyclic, and external links may refer to any file of
+    the machine, or to a pipe, on which HDF5 blocks.
     """
     parts = name.split("/")
     for i in range(len(parts)):
@@ -41,9 +41,9 @@ def find_link(file: h5py.File, name: str) -> h5py.HardLink | h5py.SoftLink | h5p
 
 
 def attribute(item: h5py.Group | h5py.Dataset, name: str, *default: object) -> object:
-    """The value of an attribute, or `default`; KeyError where it is absent and there is no default.
+    """The value of an attribute, or `default`. Raises KeyError if it is absent and there is no default.
 
-    Texts of fixed length become str, and arrays of one value that value: C and MATLAB write such ones.
+    Fixed-length strings become str and one-element arrays their element, because programs in C and MATLAB write these.
     """
     if name not in item.attrs:
         if not default:
@@ -58,13 +58,16 @@ def attribute(item: h5py.Group | h5py.Dataset, name: str, *default: object) -> o
 class Dataset:
     """Expected shape, type and range of a dataset. A letter in the shape stands for the same length in all datasets."""
 
-    shape: str
+    shape: str  # letters and numbers separated by spaces, such as "n 3"
     kind: str = "float"  # float (of any width, or integers), int or text
     low: Bound = -LARGEST
     high: Bound = LARGEST
 
     def open(self, file: h5py.File, name: str, lengths: dict[str, int]) -> h5py.Dataset:
-        """The dataset, shape and type checked; adds new letters to `lengths`. Raises KeyError if absent, ValueError."""
+        """Open the dataset, check its shape and type, and add new letters to `lengths`.
+
+        Raises KeyError if it is absent, and ValueError if it is not as expected.
+        """
         link = find_link(file, name)
         if link is None:
             raise KeyError(name)
@@ -73,7 +76,7 @@ class Dataset:
         data = file[name]
         if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.shape is None:
             raise ValueError(f"{name} is not a dataset with values of its own")
-        data.id.get_create_plist().fill_value_defined()  # ValueError for a damaged fill value, which crashes HDF5 later
+        data.id.get_create_plist().fill_value_defined()  # ValueError for a damaged fill value, which would crash HDF5
         expected = tuple(lengths.get(s, -1) if s.isalpha() else int(s) for s in self.shape.split())
         fits = len(expected) == len(data.shape) and all(e in (-1, s) for e, s in zip(expected, data.shape, strict=True))
         if not fits:
@@ -83,7 +86,7 @@ class Dataset:
         kind = "text" if text else data.dtype.kind
         if kind not in {"float": ("f", "i", "u"), "int": ("i", "u"), "text": ("text",)}[self.kind]:
             raise ValueError(f"{name} has values of type {quote(data.dtype, 40)}, not {self.kind}")
-        stored = min(data.id.get_storage_size(), file.id.get_filesize())  # the former is what a damaged index says
+        stored = min(data.id.get_storage_size(), file.id.get_filesize())  # a damaged index may overstate the former
         if data.size * data.dtype.itemsize > MAX_DEFLATE_RATIO * stored + 4096:
             raise ValueError(f"{name} declares {data.size} values, but the file stores only {stored} bytes of them")
         if data.chunks and math.prod(data.chunks) * data.dtype.itemsize > max(MAX_DEFLATE_RATIO * stored, MAX_CHUNK):
@@ -97,7 +100,7 @@ class Dataset:
         return data
 
     def read(self, file: h5py.File, name: str, lengths: dict[str, int]) -> np.ndarray | list[str]:
-        """The values as float32, int64 or strings; ValueError if one is not finite or out of range."""
+        """Read the values as float32, int64 or strings. Raises ValueError if one is not finite or out of range."""
         data = self.open(file, name, lengths)
         if self.kind == "text":
             if h5py.check_string_dtype(data.dtype).length is None:
@@ -106,7 +109,7 @@ class Dataset:
         return self.checked(read_compressed(data), name)
 
     def checked(self, values: np.ndarray, name: str) -> np.ndarray:
-        """Values in native byte order, float32 or int64; ValueError if one is not finite or out of range."""
+        """Values as float32 or int64 in native byte order. Raises ValueError if one is not finite or out of range."""
         if values.dtype.kind == "f" and values.dtype.itemsize < 4:
             values = values.astype(np.float32)
         if not ((values >= self.low) & (values <= self.high)).all():  # false for NaN

@@ -1,8 +1,8 @@
-"""Variable-length strings in HDF5 files, checked before HDF5 reads them.
+"""Check the variable-length strings in HDF5 files before HDF5 reads them.
 
-HDF5 allocates the length that a string's reference declares before it looks the string up, and loops for ever on a
-damaged global heap (H5HG__cache_heap_deserialize). A reference has 16 bytes: the length, the address of a heap and the
-index of the string in it.
+HDF5 allocates the length that a string's reference declares before it looks the string up, and loops forever on a
+damaged global heap (H5HG__cache_heap_deserialize). A reference has 16 bytes: the length, the address of a heap, and the
+index of the string in that heap.
 Source: The HDF Group, "HDF5 File Format Specification Version 3.0", III.E, IV.A.1 and IV.A.2.
 """
 
@@ -18,25 +18,25 @@ import numpy as np
 
 from stages.core.scene.h5_chunks import chunks_of, filters_of, used_filters
 
-ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # types of messages of an object header
-# Classes of datatypes: numbers, texts of fixed length, and enumerations such as booleans; texts of variable length are
-# VARIABLE_LENGTH with the bits TEXT. On damaged attributes of the other classes HDF5 may crash; ngff writes none.
+ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # message types of an object header
+# Datatype classes: numbers, fixed-length strings, and enumerations such as booleans; variable-length strings are
+# VARIABLE_LENGTH with the bits TEXT. HDF5 may crash on damaged attributes of other classes; ngff writes none of these.
 NUMBER, FLOAT, FIXED_TEXT, ENUMERATION, VARIABLE_LENGTH, TEXT = 0, 1, 3, 8, 9, 1
-HEAP = b"GCOL\x01\0\0\0"
-MAX_BLOCKS = 1000  # of an object header
+HEAP = b"GCOL\x01\0\0\0"  # signature and version of a global heap
+MAX_BLOCKS = 1000  # most blocks of an object header
 
 
 def check_texts(data: h5py.Dataset) -> None:
-    """ValueError unless all strings of a variable-length dataset lie within the file, with the declared lengths."""
+    """Raise ValueError unless all strings of a variable-length dataset lie within the file, as long as declared."""
     with _FileBytes(data.file) as file:
         for part in _stored(data, file):
             file.check(part)
 
 
 def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
-    """The same for the attributes of a file, group or dataset (object header messages).
+    """As `check_texts`, for the attributes of a file, group or dataset (object header messages).
 
-    ValueError as well for attributes that are neither numbers nor texts.
+    Also raises ValueError for attributes that are neither numbers nor strings.
     """
     with _FileBytes(item.file) as file:
         for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
@@ -44,7 +44,7 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
             start, to = (8, 8) if attribute[0] == 1 else (9, 1)
             after_name = start + -(-name // to) * to
             values = after_name + -(-kind // to) * to + -(-space // to) * to
-            # its type or shape is elsewhere, as with all of version 2
+            # reject attributes whose type or shape is stored elsewhere, and all of version 2
             if attribute[0] not in (1, 3) or after_name + 1 >= len(attribute) or attribute[1] & 3:
                 raise ValueError("an attribute of it is damaged")
             datatype, bits = attribute[after_name] & 15, attribute[after_name + 1] & 15
@@ -55,13 +55,13 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
 
 
 class _FileBytes:
-    """Memory map of an open file; ValueError for reads beyond its end."""
+    """Memory map of an open file. Raises ValueError for reads beyond its end."""
 
     def __init__(self, file: h5py.File):
         if file.userblock_size:
             raise ValueError("it begins with a user block, of another format")
         self._path = file.filename
-        self._checked: dict[int, dict[int, int]] = {}  # length of each string, by address of its heap and index
+        self._checked: dict[int, dict[int, int]] = {}  # heap address -> index of a string -> its length
 
     def __enter__(self) -> _FileBytes:
         with open(self._path, "rb") as file:
@@ -80,7 +80,7 @@ class _FileBytes:
         return int.from_bytes(self.read(at, size), "little")
 
     def check(self, references: bytes) -> None:
-        """ValueError unless each reference is empty, or no longer than its string in an intact heap."""
+        """Raise ValueError unless each reference is empty, or no longer than its string in an intact heap."""
         for at in range(0, len(references), 16):
             length, heap, index = struct.unpack_from("<IQI", references, at)
             if length and heap and length > self._lengths(heap).get(index, -1):
@@ -104,7 +104,7 @@ class _FileBytes:
 
 
 def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
-    """The references of a dataset, chunk by chunk; chunks that are not allocated have none."""
+    """Yield the references of a dataset, chunk by chunk; chunks that are not allocated are skipped."""
     if data.id.get_storage_size() == 0:
         return
     if data.chunks is None:
@@ -126,8 +126,8 @@ def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
 
 
 def _attributes(file: _FileBytes, at: int) -> Iterator[bytes]:
-    """The attribute messages of the object header at an address."""
-    new = file.read(at, 4) == b"OHDR"  # of version 2
+    """Yield the attribute messages of the object header at an address."""
+    new = file.read(at, 4) == b"OHDR"  # object header of version 2
     flags = file.number(at + 5, 1) if new else 0
     if new:
         first, width = at + 6 + 16 * bool(flags & 32) + 4 * bool(flags & 16), 1 << (flags & 3)

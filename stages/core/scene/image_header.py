@@ -1,4 +1,4 @@
-"""Size of an image from the header of its file, read before memory is allocated for its pixels."""
+"""Read the size of an image from its file header, before memory is allocated for its pixels."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 from stages.core.scene.schema import MAX_DEFLATE_RATIO
 
-MAX_PIXELS = 1 << 27  # 134 million
-MAX_RATIO = 4096  # of uncompressed to stored bytes, in formats other than PNG; JPEG reaches 1500
-PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # start-of-frame markers, without DHT, JPG and DAC
+MAX_PIXELS = 1 << 27  # most pixels of an image, 134 million
+MAX_RATIO = 4096  # largest ratio of uncompressed to stored bytes in formats other than PNG; JPEG reaches 1500
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # number of channels by colour type
+JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # start-of-frame markers: all but DHT, JPG and DAC
 JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length field
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 322, 323
 
 
 class ImageHeader(NamedTuple):
-    """What the header of an image file declares."""
+    """Size that the header of an image file declares."""
 
     width: int  # [px]
     height: int
@@ -24,7 +24,7 @@ class ImageHeader(NamedTuple):
 
 
 def read_image_header(data: bytes) -> ImageHeader:
-    """The header of a PNG, JPEG, WebP, BMP or TIFF file; ValueError for anything else."""
+    """The header of a PNG, JPEG, WebP, BMP or TIFF file. Raises ValueError for anything else."""
     for begin, read in (
         (b"\x89PNG\r\n\x1a\n", _png), (b"\xff\xd8", _jpeg), (b"RIFF", _webp), (b"BM", _bmp), (b"II", _tiff),
         (b"MM", _tiff),
@@ -35,11 +35,11 @@ def read_image_header(data: bytes) -> ImageHeader:
 
 
 def png_of_numbers(data: bytes) -> tuple[bytes, int]:
-    """A PNG of one channel that decodes to the numbers that this one stores, times the factor that is returned.
+    """A one-channel PNG that decodes to the stored numbers of this PNG times the returned factor.
 
-    With a palette the numbers are its indices, as annotation tools write labels. Decoders spread numbers of fewer than
-    8 bits over 0 to 255. PNGs of several channels are returned as they are, as are those with a palette of greys other
-    than their indices, of which either may be meant.
+    With a palette, the stored numbers are its indices, which annotation tools use as labels. Decoders stretch numbers
+    of fewer than 8 bits to the range 0 to 255, hence the factor. PNGs of several channels are returned unchanged, as
+    are those with a palette of greys that differ from their indices, where the greys may be the labels.
     """
     chunks, at = [], 8
     while at < len(data):
@@ -57,7 +57,7 @@ def png_of_numbers(data: bytes) -> tuple[bytes, int]:
 
 
 def _png(data: bytes) -> ImageHeader:
-    """Also checks the length of each chunk, which decoders allocate."""
+    """Read the header, and check the length of each chunk, which decoders allocate."""
     if data[12:16] != b"IHDR" or data[25] not in PNG_CHANNELS:
         raise ValueError("no image")
     at = 8
@@ -82,7 +82,7 @@ def _jpeg(data: bytes) -> ImageHeader:
 
 
 def _webp(data: bytes) -> ImageHeader:
-    """Without a bound of the file's size: an image of one colour has a few bytes at any resolution."""
+    """Read the header, without a bound of the file's size: an image of one colour has few bytes at any resolution."""
     kind = data[12:16]
     if data[8:12] != b"WEBP" or len(data) < 30:
         raise ValueError("no image")
@@ -103,7 +103,7 @@ def _bmp(data: bytes) -> ImageHeader:
 
 
 def _tiff(data: bytes) -> ImageHeader:
-    """The first image, at least as large as a tile, which decoders allocate."""
+    """Read the size of the first image, or of a tile if that is larger, since decoders allocate whole tiles."""
     order = "little" if data[:2] == b"II" else "big"
 
     def number(at: int, length: int) -> int:
@@ -111,7 +111,7 @@ def _tiff(data: bytes) -> ImageHeader:
             raise ValueError("no image")
         return int.from_bytes(data[at : at + length], order)
 
-    big = number(2, 2) == 43  # BigTIFF: offsets of 64 bits
+    big = number(2, 2) == 43  # BigTIFF, with 64-bit offsets
     if not big and number(2, 2) != 42:
         raise ValueError("no image")
     start, entry, word = (number(8, 8), 20, 8) if big else (number(4, 4), 12, 4)

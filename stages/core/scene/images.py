@@ -1,4 +1,4 @@
-"""Images and videos; the only module that handles the BGR order of OpenCV."""
+"""Read and write images and videos; the only module that handles OpenCV's BGR order."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.image_header import MAX_PIXELS, png_of_numbers, read_image_header
 
 log = logging.getLogger(__name__)
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our errors say the same in one line
-IGNORE_LABEL = 255  # pixels of label images that are not evaluated
-MAX_IMAGE_BYTES = 1 << 30  # of an image file
-MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
-ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
-MAX_PENDING_FRAMES = 8  # of a video that wait for the encoder
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our own errors say the same in one line
+IGNORE_LABEL = 255  # value of pixels in label images that are not evaluated
+MAX_IMAGE_BYTES = 1 << 30  # largest image file [bytes]
+MAX_VIDEO_PIXELS = 1 << 26  # most pixels of a video frame; 8K has half as many
+ENCODER_THREADS = 4  # fixed, because the encoded file depends on the number of threads
+MAX_PENDING_FRAMES = 8  # most video frames that wait for the encoder
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Image files of a folder, sorted by name, without hidden files; InputError if there are none."""
+    """Image files of a folder, sorted by name, without hidden files. Raises InputError if there are none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give a folder of photos or a video file")
@@ -43,12 +43,12 @@ def list_photos(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path) -> Float[Tensor, "h w 3"]:
-    """RGB in 0..1, rotated by its EXIF tag; alpha is dropped, 16-bit values keep float32 precision."""
+    """Read an image as RGB in 0..1, rotated by its EXIF tag; alpha is dropped, 16-bit values keep their precision."""
     return _to_floats(path, _read_rgb(path))
 
 
 def read_8_bit(path: Path) -> UInt8[Tensor, "h w 3"]:
-    """As `read_image`, in 8 bits; 8-bit files are not converted to floats in between."""
+    """As `read_image`, with 8 bits per channel; 8-bit files are not converted to floats in between."""
     pixels = _read_rgb(path)
     return torch.from_numpy(pixels if pixels.dtype == np.uint8 else to_bytes(_to_floats(path, pixels)))
 
@@ -68,9 +68,9 @@ def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
 
 
 def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
-    """A label image: one integer per pixel (up to 8 bit, or 16 where `max_bits` allows), or the indices of a palette.
+    """Read a label image: one integer per pixel (of at most `max_bits` bits), or the indices of a palette.
 
-    InputError for several channels, and for JPEG, whose compression makes other numbers at the outlines.
+    Raises InputError for several channels, and for JPEG, whose compression changes the numbers at outlines.
     """
     data, factor = image_data(path, "a label image"), 1
     _check_header(path, data)
@@ -89,7 +89,10 @@ def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
 
 
 def image_data(path: Path, what: str = "an image") -> bytes:
-    """The bytes of an image file. InputError, naming `what` is expected, if it is absent, empty or too long."""
+    """The bytes of an image file. Raises InputError, which says that `what` is expected, if it is absent or empty.
+
+    Also raises InputError if the file is too large.
+    """
     must_exist(path, what)
     with Path(path).open("rb") as file:
         data = file.read(MAX_IMAGE_BYTES + 1)
@@ -99,7 +102,7 @@ def image_data(path: Path, what: str = "an image") -> bytes:
 
 
 def _check_header(path: Path, data: bytes) -> None:
-    """Raises InputError for other files than images, and for more pixels than the file can hold."""
+    """Raise InputError for files other than images, and for more pixels than the file can hold."""
     try:
         header = read_image_header(data)
     except (ValueError, IndexError) as error:
@@ -110,7 +113,7 @@ def _check_header(path: Path, data: bytes) -> None:
 
 
 def _decode(path: Path, data: bytes, flags: int) -> np.ndarray:
-    """Pixels of an image whose header was checked, BGR. Raises InputError for a damaged one."""
+    """Decode an image whose header was checked, to BGR. Raises InputError if it is damaged."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
@@ -119,7 +122,7 @@ def _decode(path: Path, data: bytes, flags: int) -> np.ndarray:
         raise InputError(f"{path}: is damaged; convert it to JPEG or PNG") from error
     if pixels is None:
         raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
-    if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # TIFF may hold others
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32):  # TIFF allows other types
         raise InputError(f"{path}: has values of type {pixels.dtype}; convert it to 8 bits, as PNG")
     return pixels
 
@@ -132,7 +135,7 @@ def resize(image: Float[Tensor, "h w c"], width: int, height: int) -> Float[Tens
 
 
 def to_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """8-bit RGB (h, w, 3), clamped and rounded."""
+    """Convert RGB in 0..1 to 8 bits (h, w, 3), clamped and rounded."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
@@ -154,13 +157,13 @@ def to_jpeg(image: Float[Tensor, "h w 3"], quality: int = 92) -> bytes:
 
 
 def write_labels(path: Path, labels: Int[Tensor, "h w"]) -> None:
-    """Write a one-channel PNG of integers, 8 bit, or 16 bit for labels above 255."""
+    """Write a one-channel PNG of integers: 8 bits, or 16 bits for labels above 255."""
     highest = int(labels.max()) if labels.numel() else 0
     _write_pixels(path, labels.cpu().numpy().astype(np.uint8 if highest < 256 else np.uint16))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], unit: float = 1e-3) -> None:
-    """Write depth as a 16-bit PNG in steps of `unit`, by default thousandths of a scene unit; 0 is no surface."""
+    """Write depth as a 16-bit PNG in steps of `unit`, by default thousandths of a scene unit; 0: no surface."""
     _write_pixels(path, (depth.cpu() / unit).round().clamp(0, 65535).numpy().astype(np.uint16))
 
 
@@ -175,8 +178,8 @@ def _write_pixels(path: Path, pixels: np.ndarray) -> None:
 class VideoWriter:
     """Context manager that writes an H.264 MP4 frame by frame (yuv420p, index first, as browsers need it).
 
-    A thread encodes while the next frames are computed. The file appears only on success. yuv420p needs even sizes: an
-    odd last row or column is dropped. `fps` is in frames per second.
+    A thread encodes while the next frames are computed. The file appears only on success. yuv420p needs even sizes, so
+    an odd last row or column is dropped. `fps` is in frames per second.
     """
 
     def __init__(self, path: Path, fps: float):
@@ -192,7 +195,7 @@ class VideoWriter:
         return self
 
     def append(self, image: Float[Tensor, "h w 3"]) -> None:
-        """Encode one frame, RGB in 0..1; all frames have the size of the first. Raises the errors of earlier ones."""
+        """Queue a frame, RGB in 0..1, for encoding; all frames have the same size. Raises errors of earlier frames."""
         self._pending.append(self._thread.submit(self._encode, to_bytes(image)))
         while len(self._pending) > MAX_PENDING_FRAMES:
             self._pending.popleft().result()
@@ -222,14 +225,14 @@ class VideoWriter:
 
 
 def video_info(path: Path) -> tuple[int, float]:
-    """Number of frames (from the container, 0 where unknown) and frames per second."""
+    """Number of frames (as the container states it; 0: unknown) and frames per second."""
     with open_video(path) as file:
         stream = file.streams.video[0]
         return stream.frames, float(stream.average_rate or 0)
 
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
-    """The frames of a video in order, upright, RGB in 0..1. Raises InputError for a damaged video."""
+    """Yield the frames of a video in order, upright, as RGB in 0..1. Raises InputError for a damaged video."""
     with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
@@ -239,7 +242,7 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
 
 
 def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
-    """The frames of a video, upright and reduced to a longest side of `side` pixels, with their original (w, h).
+    """Yield the frames of a video, upright and reduced to a longest side of `side` pixels, with their original (w, h).
 
     Logs a warning and ends if the video is truncated.
     """
@@ -252,12 +255,12 @@ def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h
         except import_av(path).FFmpegError as error:
             log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
             return
-    if count < stream.frames:  # threads report no error at the end of a file
+    if count < stream.frames:  # with threads, the decoder reports no error at the end of a truncated file
         log.warning("%s: is truncated or damaged; %d of its %d frames are used", path, count, stream.frames)
 
 
 def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]:
-    """A frame of PyAV, rotated upright and reduced to a longest side of `side` pixels, and its original (w, h)."""
+    """A PyAV frame, rotated upright and reduced to a longest side of `side` pixels, and its original (w, h)."""
     shrink = min(1.0, side / max(frame.width, frame.height))
     size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
     pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
@@ -266,7 +269,7 @@ def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[i
 
 
 def _quarter_turns(frame: Any) -> int:
-    """Number of turns by 90 degrees, anticlockwise, after which a frame of PyAV is upright."""
+    """Number of anticlockwise turns by 90 degrees that make a PyAV frame upright."""
     return round(getattr(frame, "rotation", 0) / 90)
 
 
@@ -275,9 +278,9 @@ def _upright(frame: Any, pixels: np.ndarray) -> np.ndarray:
 
 
 def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
-    """`count` evenly spaced frames of a video, the first and the last among them, as JPEG of `longest` px or less.
+    """`count` evenly spaced frames of a video, including the first and the last, as JPEG of at most `longest` px.
 
-    A video with fewer frames gives all of them. Raises InputError for a video that cannot be read or has no frames.
+    Gives all frames of a shorter video. Raises InputError for a video that cannot be read or has no frames.
     """
     total = video_info(video)[0] or sum(1 for _ in read_video(video))
     jpegs, frames = _sample(video, total, count, longest)
@@ -289,7 +292,7 @@ def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
 
 
 def _sample(video: Path, total: int, count: int, longest: int) -> tuple[list[bytes], int]:
-    """`count` evenly spaced frames of the first `total`, and the number of all frames."""
+    """`count` evenly spaced frames among the first `total`, and the number of all frames."""
     wanted = {round(i * (total - 1) / max(count - 1, 1)) for i in range(count)}
     jpegs, frames = [], 0
     for frames, image in enumerate(read_video(video), 1):
@@ -301,7 +304,7 @@ def _sample(video: Path, total: int, count: int, longest: int) -> tuple[list[byt
 
 
 def import_av(path: Path) -> ModuleType:
-    """PyAV, which only videos need; MissingPackage, which names the video `path`, if it is not installed."""
+    """Import PyAV, which only videos need. Raises MissingPackage, naming the video `path`, if it is not installed."""
     try:
         import av
     except ImportError as error:
@@ -314,7 +317,7 @@ def open_video(path: Path) -> Any:
     must_exist(path, "a video")
     av = import_av(path)
     try:
-        # titles and comments may be in any encoding; PyAV 19 has no such argument, and never fails on them
+        # titles and comments may be in any encoding; PyAV 19 no longer has this argument, and never fails on them
         options = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
         file = av.open(str(path), **options)
     except (av.FFmpegError, OSError, ValueError) as error:
@@ -322,7 +325,7 @@ def open_video(path: Path) -> Any:
     if not file.streams.video:
         file.close()
         raise InputError(f"{path}: holds no video stream")
-    codec = file.streams.video[0].codec_context  # None for a codec that the library does not have
+    codec = file.streams.video[0].codec_context  # None for a codec that the library does not support
     width, height = (codec.width, codec.height) if codec is not None else (0, 0)
     if not width * height:
         file.close()

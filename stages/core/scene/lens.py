@@ -1,4 +1,4 @@
-"""From photos as taken to undistorted views: images, label images, points and boxes through the lens of a camera."""
+"""Undistort photos: images, label images, points and boxes, from the photo as taken to the view of its camera."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import resize
 from stages.core.scene.cameras import Cameras
 
-ASPECT_TOLERANCE = 0.03  # relative difference of the aspect ratios of an image and its photo
-INVERSION_STEPS = 100  # of the fixed-point iteration from distorted to undistorted points
-MAX_INVERSION_ERROR = 0.1  # of a point, mapped back through the lens [px]
-BOX_EDGE_POINTS = 17  # along each edge of a box, which the lens bends
+ASPECT_TOLERANCE = 0.03  # largest relative difference of the aspect ratios of an image and its photo
+INVERSION_STEPS = 100  # iterations of the fixed point that undistorts points
+MAX_INVERSION_ERROR = 0.1  # largest error of an undistorted point, mapped back through the lens [px]
+BOX_EDGE_POINTS = 17  # points along each edge of a box, which the lens bends
 HALF_PIXEL = torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], dtype=torch.float64)  # OpenCV has pixel centres at 0
 
 
@@ -35,8 +35,8 @@ class Undistortion:
     def of(cls, cameras: Cameras, view: int, size: tuple[int, int], undistorted: bool = False) -> Undistortion:
         """The map for an image of camera number `view` with this width and height.
 
-        With `undistorted` it already shows the undistorted view, and is at most resized. Raises InputError for another
-        aspect ratio than that of the photo, or of the view.
+        With `undistorted` the image already shows the undistorted view, and is at most resized. Raises InputError if
+        its aspect ratio differs from that of the photo, or of the view.
         """
         K, full, lens = photo_of(cameras, view, undistorted)
         if abs(size[0] / size[1] / (full[0] / full[1]) - 1) > ASPECT_TOLERANCE:
@@ -48,7 +48,7 @@ class Undistortion:
     def image(
         self, image: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
     ) -> Float[Tensor, "h2 w2 3"] | UInt8[Tensor, "h2 w2 3"]:
-        """Undistort an image by bilinear interpolation, at the size of the view or, if that is larger, of the image."""
+        """Undistort an image by bilinear interpolation, to the size of the view or the image, whichever is larger."""
         scale = max(1.0, self.size[0] / self.view_size[0])
         width, height = (round(side * scale) for side in self.view_size)
         K = resize(self.view_K, width / self.view_size[0], height / self.view_size[1])
@@ -58,12 +58,12 @@ class Undistortion:
         return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h2 w2"]:
-        """Undistort a label image by nearest neighbours, at the size of the view."""
+        """Undistort a label image by nearest-neighbour sampling, to the size of the view."""
         x, y = (torch.from_numpy(m).round().long() for m in self._map(self.view_K, self.view_size))
         return labels[y.clamp(0, self.size[1] - 1), x.clamp(0, self.size[0] - 1)]
 
     def points(self, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Undistort points of the image [px]; nan where the distortion has no inverse."""
+        """Undistort points of the image, to the view [px]; nan if the distortion has no inverse there."""
         distorted = (points.double() - self.K[:2, 2].double()) / self.K.double()[[0, 1], [0, 1]]
         k1, k2, p1, p2, k3 = self.distortion.double()
         x = distorted
@@ -78,7 +78,7 @@ class Undistortion:
         return torch.where(found, out, torch.nan).float()
 
     def boxes(self, boxes: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-        """Bounding boxes x0 y0 x1 y1 in the view of boxes of the image [px]; empty where they lie outside the view."""
+        """Bounding boxes x0 y0 x1 y1 in the view of boxes in the image [px]; empty if they lie outside the view."""
         size, view = (torch.tensor(s, dtype=torch.float32).repeat(2) for s in (self.size, self.view_size))
         inside = torch.minimum(boxes.clamp_min(0), size)
         t = torch.linspace(0, 1, BOX_EDGE_POINTS)

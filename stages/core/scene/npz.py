@@ -1,4 +1,4 @@
-"""NPZ files: the sizes of arrays are checked before memory is allocated."""
+"""Read NPZ files, checking the sizes of arrays before memory is allocated."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.schema import MAX_DEFLATE_RATIO, quote, reason
 
-MAX_BYTES = 16 << 30  # of all arrays
+MAX_BYTES = 16 << 30  # most bytes of all arrays together
 
 
 def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ file by name, without Python objects; errors say that `what` is expected.
+    """The arrays of an NPZ file by name; errors say that `what` is expected.
 
-    Raises InputError for other files, damaged ones, and numbers that are not finite.
+    Raises InputError for other and damaged files, Python objects, and numbers that are not finite.
     """
     must_exist(path, what)
     try:
@@ -29,7 +29,7 @@ def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
                     _check_header(file, info)
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # of almost any type, from zipfile, its decompressors and NumPy's parser
+    except Exception as error:  # zipfile, its decompressors and NumPy's parser raise errors of almost any type
         raise InputError(f"{path}: is not an NPZ file ({reason(error)}); {what} is expected") from error
     for name, array in arrays.items():
         if array.dtype.kind not in "biufU" or array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -42,7 +42,7 @@ def _size(path: Path) -> int:
 
 
 def _check_header(file: zipfile.ZipExtFile, info: zipfile.ZipInfo) -> None:
-    """ValueError if an array of the declared shape is larger than its stored data."""
+    """Raise ValueError if an array of the declared shape is larger than its stored data."""
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)

@@ -1,7 +1,7 @@
-"""The packed PLY of PlayCanvas and SuperSplat: chunks of 256 Gaussians, 16 bytes each.
+"""Decode the packed PLY of PlayCanvas and SuperSplat, with chunks of 256 Gaussians of 16 bytes each.
 
-Source: https://github.com/playcanvas/splat-transform (format description); decoded to the values that a
-standard 3D-Gaussian PLY stores.
+The result has the values that a standard 3D-Gaussian PLY stores.
+Source: https://github.com/playcanvas/splat-transform (format description).
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ def is_packed(ply: PlyData) -> bool:
 
 
 def unpack(ply: PlyData) -> dict[str, np.ndarray]:
-    """Properties (n) by name, with the names and values of a standard 3D-Gaussian PLY."""
+    """Properties (n,) by name, with the names and values of a standard 3D-Gaussian PLY."""
     vertex, chunk = ply["vertex"].data, ply["chunk"].data
     of = np.arange(len(vertex)) // CHUNK
     out: dict[str, np.ndarray] = {}
@@ -54,7 +54,7 @@ def _three(word: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _rotation(word: np.ndarray) -> np.ndarray:
-    """Quaternions w x y z from the three smaller components; the two top bits give the index of the omitted one."""
+    """Quaternions w x y z from their three smaller components; the top two bits are the index of the omitted one."""
     word = word.astype(np.uint32)
     largest = (word >> 30).astype(np.int64)
     small = np.stack([((word >> s & 1023) / 1023 - 0.5) * 2**0.5 for s in (20, 10, 0)])

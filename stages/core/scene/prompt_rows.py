@@ -1,4 +1,4 @@
-"""Prompts of a simulation (forces, pins, velocities, lifts, changes) as JSON objects in traj.h5; see README.md."""
+"""Checks of the prompts of a simulation (forces, pins, velocities, lifts, changes) as JSON objects; see README.md."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ CHANGES: dict[str, Callable] = {  # quantity that changes during a simulation ->
     "material": text,  # name of an object's material
     "pinned": flag,  # whether an object is held at its position
 }
-FIELDS: dict[str, dict[str, Callable]] = {  # of a prompt of each kind -> check of its value
+FIELDS: dict[str, dict[str, Callable]] = {  # kind of prompt -> field -> check of its value
     "force": {"object_id": _id, "force": _vector, "torque": _vector, "start": _time, "end": _time, "at": _vector},
     "pin": {"object_id": _id},
     "velocity": {"object_id": _id, "velocity": _vector},
     "lift": {"object_id": _id, "height": number},
     "change": {"what": text, "value": lambda value, what: value, "start": _time, "object_id": _id},
 }
-ABSENT = {"torque": (0.0, 0.0, 0.0), "at": None}  # values of fields that may be left out
-NULLABLE = {("force", "end"), ("force", "at"), ("change", "object_id")}
+ABSENT = {"torque": (0.0, 0.0, 0.0), "at": None}  # default values of fields that may be left out
+NULLABLE = {("force", "end"), ("force", "at"), ("change", "object_id")}  # fields that may be null
 
 
 def read_prompts(rows: Iterable[object], ids: Collection[int] | None = None) -> tuple[dict, ...]:
-    """The same prompts with all fields, numbers and vectors of floats.
+    """The prompts with all fields present, and numbers and vectors as floats.
 
-    Raises ValueError for unknown kinds, missing fields, values of other types or out of range, and objects that are
-    not among `ids`.
+    Raises ValueError for unknown kinds, missing fields, values of a wrong type or out of range, and, if `ids` are
+    given, objects that are not among them.
     """
     return tuple(_read_prompt(row, ids) for row in rows)
 

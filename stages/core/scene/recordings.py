@@ -1,4 +1,4 @@
-"""Recordings of several fixed cameras: a folder with one video, or one folder of frames, for each."""
+"""Read recordings of several fixed cameras: a folder with one video, or one folder of frames, per camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stages.core.scene.sequence import RATES
 
 
 def list_recordings(folder: Path) -> dict[str, Path]:
-    """The videos, or folders of frames, of a folder, by name. Raises InputError unless there are two or more."""
+    """The videos and folders of frames in a folder, by name. Raises InputError unless there are two or more."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give one with a video, or a folder of frames, for each camera")
@@ -53,9 +53,9 @@ def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
 
 
 def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
-    """The frames of a recording in order, reduced to a longest side of `side` pixels, with their original (w, h).
+    """Yield the frames of a recording in order, reduced to a longest side of `side` pixels, with their original (w, h).
 
-    Raises InputError for a frame of another size than the first.
+    Raises InputError if a frame's size differs from the first.
     """
     size = None
     for image, full in read_reduced_video(path, side) if path.is_file() else _read_folder(path, side):

@@ -1,4 +1,4 @@
-"""A scene: Gaussians, their objects, and the cameras of the photos."""
+"""Data model of a scene: Gaussians, their objects, and the cameras of the photos."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.schema import number, numbers, rows, text, texts, whole
 from stages.core.scene.sequence import FilmedSequence
 
-UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
+UNKNOWN_SCALE = ("assumed", "not stated")  # prefixes of the scale's `source` that mean an unknown scale
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A movable object; its Gaussians have its id."""
+    """A movable object; its Gaussians have its id as object_id."""
 
     id: int  # 1 or more
     name: str
-    material: str = ""  # empty: decided from the name
+    material: str = ""  # name of the material; empty: inferred from the object's name
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Scene:
     scale: dict = field(default_factory=lambda: {"metres_per_unit": 1.0, "source": "not stated"})
     provenance: dict = field(default_factory=dict)
     background: tuple[float, float, float] | None = None  # RGB 0..1 where there is no Gaussian
-    sequence: FilmedSequence | None = None  # the films of which the scene is the first frame
+    sequence: FilmedSequence | None = None  # timing of the videos whose first frame is the scene
 
     @property
     def metres_per_unit(self) -> float:
@@ -43,12 +43,12 @@ class Scene:
 
     @property
     def has_known_scale(self) -> bool:
-        """Whether `metres_per_unit` was measured or given; otherwise a unit is only taken as 1 m."""
+        """Whether `metres_per_unit` was measured or given; otherwise a unit is assumed to be 1 m."""
         return not str(self.scale.get("source", "not stated")).startswith(UNKNOWN_SCALE)
 
     @property
     def commands(self) -> set[str]:
-        """The commands that made it, such as "reconstruct" and "refine"."""
+        """The commands that made the scene, such as "reconstruct" and "refine", from its provenance."""
         found, made = set(), self.provenance
         while isinstance(made, dict):
             found.add(str(made.get("command", "")))
@@ -56,16 +56,16 @@ class Scene:
         return found - {""}
 
     def mass_text(self, mass: float) -> str:
-        """A mass [kg] for messages; it holds for a unit of 1 m where the scale is not known."""
+        """A mass [kg] for messages, with the condition that a unit is 1 m if the scale is not known."""
         return f"{mass:.3g} kg" + ("" if self.has_known_scale else " if one unit is 1 m")
 
     def name_of(self, object_id: int) -> str:
-        """The name of an object, object_ID where it has none."""
+        """The name of an object; object_ID if it has none."""
         return next((o.name for o in self.objects if o.id == object_id), f"object_{object_id}")
 
 
 def read_objects(rows: Iterable[Sequence]) -> tuple[SceneObject, ...]:
-    """Objects as a file states them: id, name, material; ValueError for an id that is given twice."""
+    """Objects from a file's rows of id, name and material. Raises ValueError for wrong values and duplicate ids."""
     objects = tuple(_read_object(*row) for row in rows)
     if twice := [id for id, count in Counter(o.id for o in objects).items() if count > 1]:
         raise ValueError(f"object {twice[0]} is there twice")
@@ -73,13 +73,13 @@ def read_objects(rows: Iterable[Sequence]) -> tuple[SceneObject, ...]:
 
 
 def _read_object(id: object, name: object, material: object) -> SceneObject:
-    """ValueError for another id than a whole number from 1 to MAX_OBJECT_ID."""
+    """An object. Raises ValueError unless the id is a whole number from 1 to MAX_OBJECT_ID and the rest is text."""
     id = whole(id, "an object's id", 1)
     return SceneObject(id, text(name, f"the name of object {id}"), text(material, f"the material of object {id}"))
 
 
 def read_metadata(floor: object, scale: object, provenance: object, background: object) -> dict:
-    """The arguments of a Scene of these names as a file states them; ValueError for wrong types and values."""
+    """Check a file's metadata, and return it as arguments of Scene. Raises ValueError for wrong types and values."""
     if not isinstance(scale, dict) or not isinstance(provenance, dict):
         raise ValueError("scale or provenance is not a JSON object")
     if not isinstance(provenance.get("options", {}), dict):

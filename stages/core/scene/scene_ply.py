@@ -1,4 +1,7 @@
-"""scene.ply: a standard 3D-Gaussian PLY with object ids, and metadata as JSON in header comments (README.md)."""
+"""Scene files (scene.ply): a standard 3D-Gaussian PLY with object ids, and metadata as JSON in header comments.
+
+The format is described in README.md.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,8 @@ EXPECTED = "a 3D-Gaussian PLY, such as `ngff reconstruct` writes"
 def read_scene(path: Path) -> Scene:
     """Read a 3D-Gaussian PLY of any tool (SH degree 0 to 3, either byte order, packed or not).
 
-    Gaussians with a non-finite value, one beyond LARGEST or a zero quaternion are dropped with a warning. Raises
-    InputError for other files, files without Gaussians and newer versions.
+    Gaussians with a value that is not finite or beyond LARGEST, or with a zero quaternion, are dropped with a warning.
+    Raises InputError for other files, files without Gaussians and newer versions.
     """
     path = Path(path)
     must_exist(path, EXPECTED)
@@ -56,9 +59,9 @@ def read_scene(path: Path) -> Scene:
 
 
 def _ascii_header(path: Path) -> str | io.BytesIO:
-    """What plyfile reads: the path, or a copy in memory where comments are not ASCII, as other tools write them.
+    """The input for plyfile: the path, or a copy in memory if comments are not ASCII, as from some other tools.
 
-    ValueError where the file is shorter than its header declares.
+    Raises ValueError if the file is shorter than its header declares.
     """
     header = []
     with path.open("rb") as file:
@@ -67,7 +70,7 @@ def _ascii_header(path: Path) -> str | io.BytesIO:
             if line.strip() == b"end_header":
                 check_ply_counts(header, path.stat().st_size - file.tell())
                 text = "".join(header)
-                if not text.isascii():  # escaped as in JSON, since names of objects may be in it
+                if not text.isascii():  # JSON escapes, because the text may be an object's name in JSON
                     text = re.sub("[^\\x00-\\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
                     return io.BytesIO(text.encode() + file.read())
                 break
@@ -77,7 +80,7 @@ def _ascii_header(path: Path) -> str | io.BytesIO:
 
 
 def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
-    """Gaussians from stored values, logits, logarithms and raw quaternions, in columns or rows."""
+    """Gaussians from the stored values (logits, log scales, unnormalised quaternions), in columns or rows."""
     stored = list(raw) if isinstance(raw, dict) else list(raw.dtype.names)
     missing = [name for name in REQUIRED + COLOURS if name not in stored]
     if missing:
@@ -106,18 +109,18 @@ def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
 
 
 def _columns(raw: dict[str, np.ndarray] | np.ndarray, names: list[str]) -> np.ndarray:
-    """The values of these properties as float32 (n, c)."""
+    """The values of the properties `names` as float32 (n, c)."""
     if isinstance(raw, np.ndarray) and raw.flags.c_contiguous:
         kinds = [raw.dtype[name] for name in raw.dtype.names]
         if all(kind == "<f4" or kind == "<i4" for kind in kinds) and all(raw.dtype[name] == "<f4" for name in names):
-            rows = raw.view("<f4").reshape(len(raw), -1)  # in one pass: one for each property takes many times as long
+            rows = raw.view("<f4").reshape(len(raw), -1)  # one pass; a pass per property takes many times as long
             return rows.take([raw.dtype.names.index(name) for name in names], 1).astype(np.float32, copy=False)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.stack([np.asarray(raw[name], np.float32) for name in names], 1)
 
 
 def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene:
-    """The scene with the metadata of the header comments `ngff:KEY JSON`, which other tools do not write."""
+    """The scene with the metadata of the header comments `ngff:KEY JSON`; files of other tools have none."""
     metadata: dict[str, list] = {}
     try:
         for comment in comments:
@@ -156,9 +159,9 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Write a binary little-endian 3D-Gaussian PLY with the metadata in comments; InputError if that fails.
+    """Write a binary little-endian 3D-Gaussian PLY with the metadata in comments.
 
-    Also where `read_scene` would refuse the metadata, such as a scale out of range.
+    Raises InputError if that fails, or if `read_scene` would reject the metadata, such as a scale out of range.
     """
     try:
         read_metadata(scene.floor, scene.scale, scene.provenance, scene.background)

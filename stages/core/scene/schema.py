@@ -1,6 +1,6 @@
-"""Validation of files before memory is allocated for their contents; each reader adds the schema of its own format.
+"""Checks of values in files, made before memory is allocated for contents; each reader adds its format's schema.
 
-They raise ValueError, which the reader turns into an InputError with the name of the file.
+The checks raise ValueError, which the reader turns into an InputError with the name of the file.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 MAX_JSON_BYTES, MAX_JSON_DEPTH = 256 << 20, 100
 MAX_OBJECT_ID = 65535  # label images have 16 bits
-LARGEST = 1e9  # of coordinates and sizes [scene units]; squares stay far from the limit of float32
-MAX_DEFLATE_RATIO = 1100  # of uncompressed to compressed bytes; deflate reaches 1032
-MAX_QUOTED = 80
-MAX_ROWS = 10**6  # of a list that a user writes
+LARGEST = 1e9  # largest coordinate or size [scene units]; squares stay far below the limit of float32
+MAX_DEFLATE_RATIO = 1100  # largest ratio of uncompressed to compressed bytes; deflate reaches 1032
+MAX_QUOTED = 80  # most characters of a quoted value in messages
+MAX_ROWS = 10**6  # most entries of a list that a user writes
 Bound = int | float
 PLY_WIDTHS = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
-              "double": 8, "float64": 8}  # bytes; the others have 4  # fmt: skip
+              "double": 8, "float64": 8}  # [bytes]; other types have 4  # fmt: skip
 
 
 def quote(value: object, limit: int = MAX_QUOTED) -> str:
@@ -30,41 +30,41 @@ def quote(value: object, limit: int = MAX_QUOTED) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The text of an exception for error messages; of a KeyError also its type."""
+    """The text of an exception for error messages; for a KeyError, with its type."""
     return quote(repr(error) if isinstance(error, KeyError) else error, 120)
 
 
 def number(value: object, what: str, low: Bound = -LARGEST, high: Bound = LARGEST) -> float:
-    """A finite number between two bounds; ValueError, with `what` it is, for anything else."""
-    value = value.item() if isinstance(value, np.generic) else value  # also for the message
+    """A finite number between two bounds. Raises ValueError, naming it `what`, for anything else."""
+    value = value.item() if isinstance(value, np.generic) else value  # its repr is used in the message
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not a number from {low:g} to {high:g}")
     return float(value)
 
 
 def numbers(values: object, count: int, what: str, low: Bound = -LARGEST, high: Bound = LARGEST) -> tuple[float, ...]:
-    """A list of `count` such numbers."""
+    """A list of `count` numbers, each checked by `number`. Raises ValueError for anything else."""
     if isinstance(values, (str, bytes, dict)) or not hasattr(values, "__len__") or len(values) != count:
         raise ValueError(f"{what} is {quote(repr(values), 40)}, not {count} numbers")
     return tuple(number(value, what, low, high) for value in values)
 
 
 def whole(value: object, what: str, low: int = 0, high: int = MAX_OBJECT_ID) -> int:
-    """A whole number between two bounds, also one written as 3.0; ValueError for anything else."""
+    """A whole number between two bounds; 3.0 is accepted. Raises ValueError for anything else."""
     if number(value, what, low, high) != int(value):
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not a whole number")
     return int(value)
 
 
 def text(value: object, what: str) -> str:
-    """A text, on one line and at most 200 characters long; ValueError for anything else."""
+    """A string, reduced to one line of at most 200 characters. Raises ValueError for anything else."""
     if not isinstance(value, str):
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not text")
     return quote(value, 200)
 
 
 def numbered(values: object, what: str) -> dict[int, object]:
-    """The values of a JSON object by their keys, converted to integers; ValueError for other keys and duplicates."""
+    """The values of a JSON object by its keys as integers. Raises ValueError for other keys and duplicates."""
     wrong = [key for key in table(values, "it") if not (key.isascii() and key.isdecimal() and len(key) < 10)]
     if wrong:
         raise ValueError(f"{what} is {quote(repr(wrong[0]), 40)}, not a whole number")
@@ -75,37 +75,37 @@ def numbered(values: object, what: str) -> dict[int, object]:
 
 
 def texts(values: object, what: str) -> tuple[str, ...]:
-    """A list of texts, each on one line and at most 200 characters long; ValueError for anything else."""
+    """A list of strings, each reduced to one line of at most 200 characters. Raises ValueError for anything else."""
     if not isinstance(values, (list, tuple)) or not all(isinstance(value, str) for value in values):
         raise ValueError(f"{what} is {quote(repr(values), 40)}, not a list of texts")
     return tuple(text(value, what) for value in values)
 
 
 def flag(value: object, what: str) -> bool:
-    """True or false; ValueError for anything else."""
+    """A boolean. Raises ValueError for anything else."""
     if not isinstance(value, bool):
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not true or false")
     return value
 
 
 def rows(values: object, what: str) -> list:
-    """A list of at most MAX_ROWS values; ValueError for anything else."""
+    """A list of at most MAX_ROWS values. Raises ValueError for anything else."""
     if not isinstance(values, list) or len(values) > MAX_ROWS:
         raise ValueError(f"{what} is {quote(repr(values), 40)}, not a list of at most {MAX_ROWS} values")
     return values
 
 
 def table(value: object, what: str) -> dict:
-    """A JSON object; ValueError for anything else."""
+    """A JSON object. Raises ValueError for anything else."""
     if not isinstance(value, dict):
         raise ValueError(f"{what} is {quote(repr(value), 40)}, not a JSON object")
     return value
 
 
 def parse_json(data: str, finite: bool = True) -> object:
-    """The value of a JSON text of bounded depth; ValueError for an object with two values of one key.
+    """Parse a JSON text of bounded depth. Raises ValueError for malformed text and for an object with duplicate keys.
 
-    `finite` rejects NaN, infinities and integers beyond 64 bits.
+    With `finite`, NaN, infinities and integers beyond 64 bits are rejected as well.
     """
     try:
         value = json.loads(data, object_pairs_hook=_object, **(FINITE if finite else {}))
@@ -121,7 +121,7 @@ def parse_json(data: str, finite: bool = True) -> object:
 
 
 def read_json(path: Path) -> object:
-    """The value of a JSON file (UTF-8, which Windows begins with a mark) of bounded size and depth."""
+    """Parse a JSON file (UTF-8 with or without a byte-order mark) of bounded size and depth. Raises ValueError."""
     if Path(path).exists() and not Path(path).is_file():  # reading a pipe would block
         raise ValueError("it is not a file")
     size = Path(path).stat().st_size
@@ -132,7 +132,7 @@ def read_json(path: Path) -> object:
 
 def _object(pairs: list[tuple[str, object]]) -> dict:
     found = dict(pairs)
-    if len(found) < len(pairs):  # Python would silently take the last
+    if len(found) < len(pairs):  # Python's json would silently keep the last value
         twice = next(key for i, (key, _) in enumerate(pairs) if key in dict(pairs[:i]))
         raise ValueError(f"{quote(repr(twice), 40)} is there twice")
     return found
@@ -155,7 +155,10 @@ FINITE = {"parse_constant": _finite, "parse_float": _finite, "parse_int": _int64
 
 
 def check_ply_counts(header: Sequence[str], size: int) -> None:
-    """Compare the counts that the lines of a PLY header declare with the bytes that follow it; no lists."""
+    """Check the counts in a PLY header against the `size` [bytes] of the data after it.
+
+    Raises ValueError if the data are too short, and for list properties.
+    """
     ascii_file = any(line.split()[:2] == ["format", "ascii"] for line in header)
     needed, count = 0, 0
     for line in header:

@@ -1,4 +1,4 @@
-"""Timing of the videos in which several fixed cameras filmed the motion of a scene."""
+"""Timing of videos of a moving scene, filmed by several fixed cameras."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import asdict, dataclass
 from stages.core.scene.schema import number, quote, whole
 
 MAX_FRAMES = 10**6
-RATES = 1e-3, 1e6  # lowest and highest [frames/s]
+RATES = 1e-3, 1e6  # lowest and highest frame rate [1/s]
 
 
 @dataclass(frozen=True)
 class FilmedSequence:
-    """The motion whose first frame is a scene, filmed by several fixed cameras."""
+    """Timing of a motion, filmed by several fixed cameras, whose first frame is a scene."""
 
     fps: float  # frame rate of all videos [1/s]
     frames: int  # from the release to rest, the first being the release
-    starts: dict[str, float]  # by camera: frame number of its video at the release, with fractions
+    starts: dict[str, float]  # camera -> frame number of its video at the release, with a fraction
 
     def to_json(self) -> dict:
         """As stored in the header of scene.ply."""
@@ -24,7 +24,7 @@ class FilmedSequence:
 
 
 def read_sequence_json(value: object) -> FilmedSequence | None:
-    """The inverse of `to_json`, and None for None; ValueError for wrong types and values."""
+    """The inverse of `to_json`; None for None. Raises ValueError for wrong types and values."""
     if value is None:
         return None
     if not isinstance(value, dict) or not isinstance(value.get("starts"), dict):

@@ -1,4 +1,4 @@
-"""traj.h5: the motion of a scene, with everything needed to render it. The format is described in README.md."""
+"""Trajectory files (traj.h5): the motion of a scene and everything needed to render it; format in README.md."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "frames/quats": Dataset("t n 4"),
     "frames/scales": Dataset("t n 3", low=0),
 }
-SERIES = ("keypoints/positions", "objects/com", "objects/rotation")  # a row for each frame
+SERIES = ("keypoints/positions", "objects/com", "objects/rotation")  # datasets with one row per frame
 BUFFERED = 32  # frames that are compressed and written together
 ROUNDING = 1e-2  # tolerance of weight sums and quaternion norms, which are stored in 16-bit floats
 
@@ -71,7 +71,7 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class Binding:
-    """The keypoints that each Gaussian follows: weights sum to 1; index -1 with weight 0 for none."""
+    """The keypoints that each Gaussian follows: weights sum to 1; unused entries have index -1 and weight 0."""
 
     index: Int[Tensor, "n j"]
     weight: Float[Tensor, "n j"]
@@ -89,7 +89,7 @@ class SimulationInfo:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A trajectory in memory; dense frames stay in the file and are read one at a time."""
+    """A trajectory in memory. Dense frames stay in the file and are read one at a time."""
 
     scene: Scene
     info: SimulationInfo
@@ -99,16 +99,16 @@ class Trajectory:
     com: Float[Tensor, "t o 3"]  # centres of mass [scene units]
     rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
     path: Path
-    dense: bool = False  # whether the file has every Gaussian in every frame
+    dense: bool = False  # whether the file stores every Gaussian in every frame
     field: FieldStart | None = None  # initial conditions of the learned engine, if it simulated the motion
-    confidence: Float[Tensor, "t o"] | None = None  # of a tracked motion, 0 where an object was lost; None: all certain
-    plausibility: dict | None = None  # measures of the simulation, {"objects": {id: {name: x}}, name: x}
+    confidence: Float[Tensor, "t o"] | None = None  # of a tracked motion; 0: object lost. None: all certain
+    plausibility: dict | None = None  # measures of the simulation: {"objects": {id: {name: x}}, name: x}
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def frame(self, t: int) -> Gaussians:
-        """All Gaussians in frame t, read from the file; requires `dense`. Raises InputError if the frame is damaged."""
+        """Read all Gaussians of frame t from the file; requires `dense`. Raises InputError if the frame is damaged."""
         with h5py.File(self.path, "r") as file:
             names = [f"frames/{name}" for name in ("means", "quats", "scales")]
             try:
@@ -124,13 +124,13 @@ class Trajectory:
 class TrajectoryWriter:
     """Context manager that writes a trajectory frame by frame; the file appears only on success.
 
-    When an InputError ends the run after some frames, these are kept as NAME.partial.h5. Raises InputError where the
-    file cannot be written.
+    If an InputError ends the run, the frames before it are kept as NAME.partial.h5. Raises InputError if the file
+    cannot be written.
     """
 
     def __init__(self, path: Path, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding):
         self.path, self.frames = Path(path), 0
-        self._buffer: list[tuple[np.ndarray, ...]] = []  # frames that are not in the file yet
+        self._buffer: list[tuple[np.ndarray, ...]] = []  # frames not yet in the file
         self._contents = scene, info, keypoints, binding
 
     def __enter__(self) -> TrajectoryWriter:
@@ -171,7 +171,7 @@ class TrajectoryWriter:
         return self._part
 
     def restart(self) -> None:
-        """Drop all frames, and the prompts that were added."""
+        """Drop all frames and all prompts added since the start."""
         self.frames = 0
         self._buffer.clear()
         for name in SERIES:
@@ -179,7 +179,7 @@ class TrajectoryWriter:
         self._file["forces/json"].resize(len(self._contents[1].forces), axis=0)
 
     def store_prompts(self, prompts: Sequence[dict]) -> None:
-        """Append the prompts beyond those already stored, and flush the file."""
+        """Append the prompts that are not stored yet, and flush the file; `prompts` begins with the stored ones."""
         self._write_buffer()
         self._raw.check()
         data = self._file["forces/json"]
@@ -191,7 +191,7 @@ class TrajectoryWriter:
         self._raw.check()
 
     def store_provenance(self, facts: dict) -> None:
-        """Replace the provenance by one with facts that are known only at the end of the run."""
+        """Replace the provenance, to add facts that are known only at the end of the run."""
         self._file.attrs["provenance"] = json.dumps(facts)
         self._raw.check()
 
@@ -267,7 +267,7 @@ def _check_unit(quats: Float[Tensor, "*n 4"], name: str) -> None:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a trajectory except its dense frames. Raises InputError for other files and damaged or newer ones."""
+    """Read a trajectory without its dense frames. Raises InputError for other, damaged and newer files."""
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
@@ -283,7 +283,7 @@ def read_trajectory(path: Path) -> Trajectory:
     except KeyError as error:
         raise InputError(f"{path}: a part of the trajectory is missing ({quote(error.args[0])}); see "
                          "stages/core/scene/README.md") from error  # fmt: skip
-    except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises all of them
+    except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises any of these
         why = reason(error)
         raise InputError(f"{path}: is not a readable HDF5 file ({why}); {EXPECTED} is expected") from error
 
@@ -342,7 +342,7 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
 
 
 def _read_plausibility(measures: object) -> dict | None:
-    """The measures of a file, or None where it has none; ValueError unless they are numbers from 0 by name."""
+    """The plausibility measures of a file, or None if there are none. Raises ValueError unless all are numbers >= 0."""
     if not isinstance(measures, dict) or not isinstance(measures.get("objects", {}), dict):
         raise ValueError("plausibility is not a JSON object with objects")
     groups = {**measures.get("objects", {}), "": {k: v for k, v in measures.items() if k != "objects"}}

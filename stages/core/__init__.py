@@ -1,1 +1,1 @@
-"""Modules used by several stages; a folder imports only from those above it (see tests/pipeline/test_layout.py)."""
+"""Modules shared by the stages; folders import each other in a fixed order (see tests/pipeline/test_layout.py)."""

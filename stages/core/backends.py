@@ -1,4 +1,4 @@
-"""Backends as tables of names: a backend is a function, imported only when it is chosen."""
+"""Tables of backends by name: a backend is a function, imported only when it is chosen."""
 
 import gc
 from collections.abc import Callable, Mapping
@@ -7,7 +7,7 @@ from importlib import import_module
 
 from stages.core.errors import InputError
 
-MAX_SEED = 2**31 - 1  # which every library takes
+MAX_SEED = 2**31 - 1  # largest seed that every library accepts
 
 
 @dataclass(frozen=True)
@@ -16,16 +16,16 @@ class Backend:
 
     entry: str  # "module:function"
     help: str  # one line
-    find_weights: str = ""  # of a network: "module:function" that returns the path of its published weights
-    network: str = ""  # of a promptable one: "module:function" that loads it, see stages/segment/prompted.py
-    package: str = ""  # optional package that it needs
+    find_weights: str = ""  # for a network: "module:function" that returns the path of its published weights
+    network: str = ""  # for a promptable network: "module:function" that loads it, see stages/segment/prompted.py
+    package: str = ""  # optional package that the backend needs
     extra: str = ""  # extra of this project that installs the package
 
 
 def choose(table: Mapping[str, str | Backend], option: str, name: str) -> Callable:
-    """The function that a table of "module:function" entries or of rows lists under `name`.
+    """Load the function that a table of "module:function" entries or `Backend` rows lists under `name`.
 
-    `option`: as typed on the command line, for the InputError where the table lacks the name.
+    Raises InputError if the table lacks the name; `option`, as typed on the command line, is for its message.
     """
     if name not in table:
         raise InputError(f"{option} {name}: choose from {', '.join(table)}")
@@ -44,10 +44,10 @@ def describe(table: Mapping[str, Backend]) -> str:
 
 
 def load(entry: str) -> Callable:
-    """The function or class that a "module:name" string refers to, imported now.
+    """Import the function or class that a "module:name" string refers to.
 
-    The garbage collector is paused: an import makes many objects and no garbage, and searching them again and again
-    takes a third of the time of importing Warp.
+    The garbage collector is paused: an import creates many objects but no garbage, and traversing them repeatedly takes
+    a third of the time to import Warp.
     """
     module, name = entry.split(":")
     enabled = gc.isenabled()
@@ -62,7 +62,7 @@ def load(entry: str) -> Callable:
 def pick_device(name: str) -> str:
     """The PyTorch device, "cpu" or "cuda", for --device auto, cpu, cuda or cuda:N, which makes GPU N the current one.
 
-    Raises InputError for another name and for a GPU that is not there.
+    Raises InputError for another name and for a missing GPU.
     """
     import torch  # takes a second to import, so only when a stage runs
 

@@ -2,11 +2,11 @@
 
 
 class InputError(Exception):
-    """Invalid input: the message is one line that names the file or option, what is wrong and what would work.
+    """Invalid input. The message is one line that names the file or option, what is wrong and what would work.
 
     The command line prints it without a traceback and exits with status 2.
     """
 
 
 class MissingPackage(InputError):
-    """A package that this input or option needs is not installed, or not completely; the message says how to."""
+    """A package that an input or option needs is missing or incomplete; the message says how to install it."""

@@ -26,7 +26,7 @@ def centres(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 3"]:
 
 
 def look_at(eye: Float[Tensor, "*b 3"], target: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """World-to-camera matrix of a camera at `eye` without roll (world z up) looking at `target`.
+    """World-to-camera matrix of a camera at `eye` that looks at `target` without roll (world z up).
 
     The viewing direction must not be vertical.
     """

@@ -1,4 +1,4 @@
-"""Cells of a grid, as rows of integers."""
+"""Operations on grid cells, given as rows of integers."""
 
 from math import prod
 
@@ -8,9 +8,9 @@ from torch import Tensor
 
 
 def distinct_cells(cells: Int[Tensor, "n d"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "u"]]:
-    """The number of each row among the distinct rows, in lexicographic order, and how often each of these occurs.
+    """Index of each row among the distinct rows, in lexicographic order, and the count of each distinct row.
 
-    As `unique(dim=0)` finds them, but many times faster: rows are compared as single numbers where these fit.
+    As `unique(dim=0)`, but many times faster: rows are encoded as single numbers if these fit in 62 bits.
     """
     if not len(cells):
         return cells.new_zeros(0), cells.new_zeros(0)

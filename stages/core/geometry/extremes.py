@@ -1,10 +1,10 @@
-"""Directions spread evenly over a sphere, and the points that are the farthest in them."""
+"""Directions spread evenly over a sphere, and the extreme points of a set in these directions."""
 
 from __future__ import annotations
 
 import numpy as np
 
-EQUALLY_FAR = 1e-5  # difference of heights relative to the largest, below which they count as equal
+EQUALLY_FAR = 1e-5  # difference of two heights below which they count as equal [largest height]
 
 
 def fibonacci(count: int) -> np.ndarray:
@@ -19,9 +19,9 @@ EXTREMES = np.concatenate([np.eye(3), -np.eye(3), fibonacci(200)]).astype(np.flo
 
 
 def extreme_rows(points: np.ndarray) -> np.ndarray:
-    """Sorted rows of those points (n, 3) that are the farthest in one of EXTREMES, the first of those equally far.
+    """Sorted rows of the points (n, 3) that are extreme in one of the directions EXTREMES.
 
-    Rounding therefore does not choose among the points of a flat side.
+    The first of equally far points is taken, so that rounding does not choose among the points of a flat side.
     """
     height = EXTREMES @ (points - points.mean(0)).T
     top = height.max(1, keepdims=True)

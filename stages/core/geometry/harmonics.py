@@ -10,7 +10,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
 
 
 def degree_of(k: int) -> int:
-    """Degree of a set of k = (degree + 1)^2 coefficients; ValueError unless it is 0 to 3."""
+    """Degree of a set of k = (degree + 1)^2 coefficients. Raises ValueError unless it is 0 to 3."""
     degree = round(k**0.5) - 1
     if (degree + 1) ** 2 != k or not 0 <= degree <= 3:
         raise ValueError(f"{k} coefficients are not a full set of degree 0 to 3")
@@ -52,7 +52,7 @@ def rgb_to_sh(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
 
 @cache
 def probes() -> tuple[Tensor, dict[int, Tensor]]:
-    """Fixed unit directions, and for each band the pseudo-inverse that maps values there to coefficients."""
+    """Fixed unit directions, and for each band the pseudo-inverse that maps function values there to coefficients."""
     dirs = torch.randn(16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     dirs = dirs / dirs.norm(dim=-1, keepdim=True)
     values = basis(dirs, 3)
@@ -62,7 +62,7 @@ def probes() -> tuple[Tensor, dict[int, Tensor]]:
 def rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
     """Coefficients of the colour function rotated by R: new(d) = old(R^T d).
 
-    Bands do not mix under rotation, so each is sampled at fixed directions and solved for (exact to rounding).
+    Bands do not mix under rotation, so each band is sampled at fixed directions and solved for (exact up to rounding).
     """
     degree = degree_of(sh.shape[1])
     if degree == 0:

@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-QUERIES_PER_THREAD = 500  # fewer take less time than starting a thread
+QUERIES_PER_THREAD = 500  # fewer queries take less time than starting a thread
 
 
 class KDTree:
-    """k-d tree on the CPU, for repeated queries. Cells are split in the middle: balancing doubles the building time."""
+    """k-d tree on the CPU, for repeated queries. Cells are split in the middle: balancing doubles the build time."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
-        from scipy.spatial import cKDTree  # 0.2 s to import, and many runs search no neighbours
+        from scipy.spatial import cKDTree  # takes 0.2 s to import, and many runs do not need it
 
         if not len(points):
             raise ValueError("the tree needs at least one point")
@@ -24,21 +24,21 @@ class KDTree:
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
         """Distances and indices of the k nearest points, nearest first; beyond `within` the distance is inf."""
-        ranks = list(range(1, k + 1))  # a list keeps the last axis where k is 1
+        ranks = list(range(1, k + 1))  # a list keeps the last axis if k is 1
         workers = max(1, min(torch.get_num_threads(), points.numel() // points.shape[-1] // QUERIES_PER_THREAD))
         distance, index = self.tree.query(points.detach().numpy(), ranks, distance_upper_bound=within, workers=workers)
         return torch.from_numpy(distance).to(points), torch.from_numpy(index).clamp_(max=self.size - 1)
 
 
 class BruteForce:
-    """Brute-force search by matrix products: for a few thousand points faster than a tree on a GPU.
+    """Brute-force search by matrix products, on a GPU faster than a tree for a few thousand points.
 
-    Candidates are found in float32 by |x|^2 - 2 q.x, where the order of points whose squared distances differ by less
-    than about 1e-6 |x|^2 is arbitrary, so points should be centred on the origin. The k nearest of k + SPARE candidates
-    are then chosen by their exact distances; a single neighbour is taken as it is.
+    Candidates are ranked in float32 by |x|^2 - 2 q.x. The order of points whose squared distances differ by less than
+    about 1e-6 |x|^2 is arbitrary, so points should be centred on the origin. The k nearest of k + SPARE candidates are
+    then chosen by their exact distances; for k = 1 the best candidate is taken without this step.
     """
 
-    MAX_ENTRIES = 2**26  # of the distance matrix held at once, 256 MB
+    MAX_ENTRIES = 2**26  # most entries of the distance matrix held at once, 256 MB
     SPARE = 4  # candidates beyond k
 
     def __init__(self, points: Float[Tensor, "n d"]):
@@ -48,7 +48,7 @@ class BruteForce:
     def query(
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Same as `KDTree.query`."""
+        """As `KDTree.query`."""
         flat, have = points.reshape(-1, points.shape[-1]), min(k, len(self.points))
         chunks = flat.split(max(1, self.MAX_ENTRIES // len(self.points)))
         candidates = 1 if have == 1 else min(have + self.SPARE, len(self.points))
@@ -74,7 +74,7 @@ def knn(
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Distances and indices of the k nearest points to each query, nearest first.
 
-    With fewer than k points the last one is repeated. Uses a k-d tree on the CPU.
+    With fewer than k points, the farthest one is repeated. Uses a k-d tree on the CPU.
     """
     have = min(k, len(points))
     distance, index = (found.to(queries.device) for found in KDTree(points.cpu()).query(queries.cpu(), have))
@@ -83,6 +83,6 @@ def knn(
 
 
 def spacing(points: Float[Tensor, "n 3"], k: int = 3) -> Float[Tensor, "n"]:
-    """Root mean square distance of each point to its k nearest neighbours."""
+    """Root-mean-square distance of each point to its k nearest neighbours."""
     distance, _ = knn(points, points, k + 1)
     return distance[:, 1:].square().mean(1).sqrt()

@@ -17,12 +17,12 @@ class Plane(NamedTuple):
     offset: float
 
     def heights(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Signed distances, positive on the side the normal points to."""
+        """Signed distances, positive on the side to which the normal points."""
         return points @ self.normal - self.offset
 
 
 def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None) -> Plane:
-    """Weighted least-squares plane of at least three points; the sign of its normal is arbitrary."""
+    """Weighted least-squares plane through at least three points; the sign of its normal is arbitrary."""
     w = torch.ones_like(points[:, 0]) if weights is None else weights
     centre = (points * w[:, None]).sum(0) / w.sum()
     centred = points - centre
@@ -31,7 +31,7 @@ def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None =
 
 
 def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
-    """Unit normals and offsets of the planes through three points each; collinear points give a zero normal."""
+    """Unit normals and offsets of the planes through triples of points; collinear points give a zero normal."""
     a, b, c = triples.unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a))
     return normals, (normals * a).sum(1)
@@ -40,7 +40,7 @@ def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"
 def _count_within(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "k 3"], offsets: Float[Tensor, "k"], threshold: float
 ) -> Float[Tensor, "k"]:
-    """Number of points within `threshold` of each plane; in place, with so few planes that the caches hold them all."""
+    """Number of points within `threshold` of each plane, in place; call it with so few planes that all fit in cache."""
     distance = (points @ normals.mT).sub_(offsets).abs_()
     return torch.lt(distance, threshold, out=distance).sum(0)
 
@@ -53,10 +53,11 @@ def ransac(
     trials: int = 2000,
     seed: int = 0,
 ) -> tuple[Plane, Bool[Tensor, "n"]] | None:
-    """The plane with the largest weight of points within `threshold`, and the mask of these inliers; None if none.
+    """The plane with the largest total weight of inliers, and their mask; None if there is no plane.
 
-    `allowed` maps unit normals to a mask of acceptable ones; each candidate is tested with both signs of its normal,
-    and the accepted sign is kept. The best sample is refined by three least-squares fits to its inliers.
+    Inliers are points within `threshold` of the plane. `allowed` maps unit normals to a mask of acceptable ones; each
+    candidate is tested with both signs of its normal, and an accepted sign is kept. The best sample is refined by three
+    least-squares fits to its inliers.
     Source: Fischler and Bolles 1981, "Random sample consensus".
     """
     if len(points) < 3:
@@ -74,7 +75,7 @@ def ransac(
     if not good.any():
         return None
     normals, offsets = normals[good], offsets[good]
-    drawn = points[sample]  # by weight, so their number is weighted
+    drawn = points[sample]  # drawn by weight, so counts of them are weighted
     counts = [_count_within(drawn, n, d, threshold) for n, d in zip(normals.split(64), offsets.split(64), strict=True)]
     best = int(torch.cat(counts).argmax())
     plane = Plane(normals[best], float(offsets[best]))

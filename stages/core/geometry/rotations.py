@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def matrix(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrices of quaternions w x y z, normalised here; a zero quaternion gives nan."""
+    """Rotation matrices of quaternions w x y z, which need not be normalised; a zero quaternion gives nan."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -24,7 +24,7 @@ def quaternion(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     """
     m = R.flatten(-2)
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
-    # row i is 4 q_i (w, x, y, z)
+    # row i of the products is 4 q_i (w, x, y, z)
     products = torch.stack([
         torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1),
         torch.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1),
@@ -56,7 +56,7 @@ def covariance(quats: Float[Tensor, "*b 4"], scales: Float[Tensor, "*b 3"]) -> F
 
 
 def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Smallest rotation from direction `a` to direction `b`; arbitrary axis for opposite directions."""
+    """Smallest rotation from direction `a` to direction `b`; opposite directions get an arbitrary axis."""
     a, b = a / a.norm(), b / b.norm()
     if torch.dot(a, b) < -1 + 1e-6:
         axis = torch.linalg.cross(a, torch.eye(3).to(a)[a.abs().argmin()])
@@ -67,7 +67,7 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
 
 
 def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Angle of a rotation, 0 to 180 [degrees]."""
+    """Angle of each rotation, 0 to 180 [degrees]."""
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
 

@@ -26,11 +26,11 @@ class Similarity(NamedTuple):
         return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
 
     def to(self, device: str | torch.device) -> "Similarity":
-        """The same transform on a device."""
+        """The transform on a device."""
         return Similarity(self.scale, self.rotation.to(device), self.translation.to(device))
 
     def viewmats(self, viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 4 4"]:
-        """World-to-camera matrices for the transformed world: same pixels, depths multiplied by the scale."""
+        """World-to-camera matrices in the transformed world: same pixels, depths multiplied by the scale."""
         out = viewmats.clone()
         out[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.mT
         out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - out[:, :3, :3] @ self.translation

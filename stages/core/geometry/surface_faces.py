@@ -1,7 +1,7 @@
-"""The faces that meet at points of a surface, from the points around them.
+"""Normals of the faces that meet at each point of a sampled surface.
 
-At an edge the normals of points are between those of the faces, and so is the direction in which signed distances
-increase. A contact acts along the normal of a face.
+Near an edge, both the normals of the samples and the gradient of the signed distance lie between the normals of the
+adjacent faces. A contact force, however, acts along the normal of a face, so faces are found from neighbouring samples.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 6  # points, with itself, whose normals decide whether one is on a face
-OTHER_SIDE = -0.5  # cosine to its normal below which they are on the other side of a sheet
-FACE_COSINE = 0.97  # least length of the mean of their normals, .71 at a cube's edges and .58 at its corners
-AROUND = 24  # nearest points among which the faces at an edge or a corner are
-SAME_FACE = 0.9  # least cosine between normals of one face
-NEAR = 4  # edges of a grid from the surface up to which the nearest point is looked for
-FACES = 3  # that meet in a corner, at most
-BETWEEN = 0.5  # least cosine of a normal between those of faces to one of them, .58 at a cube's corners
-OPPOSED = 0.9  # least cosine of the angle at which the faces of two surfaces are parallel, at the edges of both
-CURVED = 5e-4  # difference of flatness that counts: a plane has 1, a ball of 2000 points .998
+NEIGHBOURS = 6  # nearest points, including itself, whose normals decide whether a point is on a face
+OTHER_SIDE = -0.5  # cosine between two normals below which their points are on different sides of a sheet
+FACE_COSINE = 0.97  # least length of the mean normal around a point on a face; .71 at a cube's edge, .58 at a corner
+AROUND = 24  # nearest points among which the faces at an edge or a corner are searched
+SAME_FACE = 0.9  # least cosine between two normals of one face
+NEAR = 4  # distance from the surface up to which a grid node gets its nearest point [grid spacing]
+FACES = 3  # most faces that meet at a point
+BETWEEN = 0.5  # least cosine between a point's normal and the nearest of its faces' normals; .58 at a cube's corners
+OPPOSED = 0.9  # least cosine between one face normal and the reverse of another at which two faces are parallel
+CURVED = 5e-4  # least difference of flatness that is significant; flatness of a plane 1, of a ball of 2000 points .998
 
 
 def surface_faces(
     points: np.ndarray, normals: np.ndarray, at_edge: np.ndarray | bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How flat (n,) the surface is at points (n, 3) with outward normals (n, 3), and the normals (n, 3, 3) of the faces
-    at each: that of its face, or of up to three around it; the others are 0.
+    """Flatness (n,) of the surface at points (n, 3) with outward normals (n, 3), and normals (n, 3, 3) of the faces.
 
-    Those `at_edge` (n,) are known not to be on a face, even where all points around them are in one place. Flatness
-    is 1 in a plane, and 0 where a point is not on a face.
+    A point on a face has the normal of that face, any other those of up to three adjacent faces; unused rows are 0.
+    Flatness is 1 in a plane, and 0 if a point is not on a face. Points `at_edge` (n,) are known not to be on a face,
+    even if the neighbouring points coincide.
     """
     near = cKDTree(points).query(points, min(AROUND, len(points)))[1].reshape(len(points), -1)
     around = normals[near[:, :NEIGHBOURS]]
@@ -43,15 +43,16 @@ def surface_faces(
         new = np.flatnonzero(on_face[row] & ~known & (count < FACES))
         faces[new, count[new]] = normals[row[new]]
         count[new] += 1
-    # a face that is too small to have inner points; the normals of corners are those of no face
+    # the point's own face is too small to have inner points; at corners, a point's normal is that of no face
     small = ((faces * normals[:, None]).sum(-1).max(1) < BETWEEN) & ~np.asarray(at_edge)
     faces[small, 1:], faces[small, 0] = faces[small, :-1], normals[small]
     return np.where(on_face, flatness, 0.0), faces
 
 
 def nearest_points(points: np.ndarray, depth: np.ndarray, low: np.ndarray, h: float) -> np.ndarray:
-    """For the nodes near the surface of a grid of depths (x, y, z), which begins at `low` (3,) and has edges h, the row
-    of the nearest of some points (n, 3); -1 for the other nodes.
+    """Row of the nearest of the points (n, 3) for each node (x, y, z) of a grid near the surface; -1 for other nodes.
+
+    `depth` (x, y, z) is the depth below the surface at the nodes, `low` (3,) the first node, and `h` the grid spacing.
     """
     out = np.full(depth.shape, -1)
     if len(points):

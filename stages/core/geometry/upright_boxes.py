@@ -1,4 +1,4 @@
-"""Size of an object that stands anywhere in a scene: that of an upright box around it, turned as the object is."""
+"""Size of an object from its upright bounding box, independent of the object's heading."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 
 def longest_side(points: Float[Tensor, "n 3"]) -> float:
-    """The longest side of the upright box of least girth around points. It does not depend on the axes x and y.
+    """The longest side of the upright bounding box of least horizontal perimeter. Independent of the axes x and y.
 
-    One of its sides is that of the convex hull of the points seen from above: Toussaint 1983, "Solving geometric
-    problems with the rotating calipers".
+    A side of this box contains a side of the convex hull of the points seen from above (Toussaint 1983, "Solving
+    geometric problems with the rotating calipers").
     """
     x = points.detach().cpu().double().numpy()
     height = float(np.ptp(x[:, 2]))
     try:
         corners = x[ConvexHull(x[:, :2]).vertices, :2]
-    except (QhullError, ValueError):  # on a line, or few
+    except (QhullError, ValueError):  # collinear or too few points
         return max(height, float(np.linalg.norm(np.ptp(x[:, :2], axis=0))))
     along = np.roll(corners, -1, 0) - corners
     along /= np.linalg.norm(along, axis=1, keepdims=True)

@@ -1,1 +1,1 @@
-"""The player: a page that draws a scene or a trajectory with WebGL2, from one file and without a server."""
+"""The player: a page that draws a scene or a trajectory with WebGL2, in one file and without a server."""

@@ -1,9 +1,9 @@
-"""The binary container of a page: arrays of integers of few bits, stored as byte planes and deflated.
+"""Binary container of a page: arrays of integers of few bits, stored as byte planes and deflated.
 
 Layout after inflation: length of the header (uint32, little endian), the header (JSON), the arrays. The header's
-`arrays` describe each: `rows` x `columns` values low[c] + step[c] q, of which q is stored in `planes` bytes: first the
-low bytes of all values, column after column, then the next bytes. With `delta`, q are differences to the row before,
-modulo 256^planes; with `float`, q are the bits of float32 values. web/container.js reads it.
+`arrays` describe each array: `rows` x `columns` values low[c] + step[c] q, with q in `planes` bytes: first the low
+bytes of all values, column after column, then the next bytes, and so on. With `delta`, differences of q to the previous
+row are stored, modulo 256^planes; with `float`, q are the bits of float32 values. web/container.js reads the container.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MAX_BITS = 24  # exact in the float32 that the page computes with
+MAX_BITS = 24  # most bits of an integer that is exact in the float32 of the page
 
 
 @dataclass(frozen=True)
 class PackedArray:
-    """Values low + step q with whole numbers q of at most `bits` bits."""
+    """Values low + step q with non-negative integers q of at most `bits` bits."""
 
     q: Int[Tensor, "r c"]
     low: tuple[float, ...]  # of column c: low[c % len(low)]
@@ -63,13 +63,13 @@ def quantised(values: Float[Tensor, "r c"], bits: int, axes: int | None = None, 
 
 
 def bits_for(extent: float, resolution: float) -> int:
-    """Bits with which steps over `extent` are at most `resolution`: 8 to MAX_BITS."""
+    """Number of bits, 8 to MAX_BITS, for which the steps over `extent` are at most `resolution`."""
     levels = extent / max(resolution, 1e-30) + 1
     return min(max(int(np.ceil(np.log2(levels))), 8), MAX_BITS)
 
 
 def pack(header: dict, arrays: dict[str, PackedArray]) -> bytes:
-    """The container with this header and these arrays."""
+    """Serialise and compress a header and arrays."""
     described, blobs, offset = {}, [], 0
     for name, array in arrays.items():
         planes = -(-array.bits // 8)

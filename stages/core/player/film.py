@@ -1,4 +1,4 @@
-"""A scene or a trajectory as a page: Gaussians and the motion of their keypoints, quantised, in one HTML file."""
+"""Pack a scene or a trajectory into one HTML file: Gaussians and the motion of their keypoints, quantised."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints, Trajectory
 
 WEB = Path(__file__).parent / "web"
-MIN_DRAWN_OPACITY = 1 / 255  # Gaussians below are not drawn by the rasteriser either
-KEYPOINT_BITS = 16  # of the extent of the keypoints at rest; more where they leave it
-POSITION_STEP = 0.05  # of centres [typical smallest scale of the Gaussians]
-HARMONICS_BITS = (10, 8, 7, 6)  # of each band
+MIN_DRAWN_OPACITY = 1 / 255  # opacity below which Gaussians are left out; the rasteriser does not draw them either
+KEYPOINT_BITS = 16  # resolution over the extent of the keypoints at rest; a larger extent of the motion has more bits
+POSITION_STEP = 0.05  # quantisation step of centres [typical smallest scale of the Gaussians]
+HARMONICS_BITS = (10, 8, 7, 6)  # per band of spherical harmonics
 WEIGHT_BITS, OPACITY_BITS, SCALE_BITS, QUATERNION_BITS, IRRADIANCE_BITS = 8, 8, 10, 10, 12
-OUTLIERS = 1e-4  # fraction of the harmonics at either end that are clipped
+OUTLIERS = 1e-4  # fraction of the harmonics clipped at either end of their range
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the keypoints, and what else the page shows of a simulation."""
+    """Motion of the keypoints, and the other parts of a simulation that the page shows."""
 
     keypoints: Keypoints
     binding: Binding
     positions: Float[Tensor, "t p 3"]  # [scene units]
     com: Float[Tensor, "t o 3"]  # [scene units]
     rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
-    dt: float  # between frames [s]
-    forces: tuple[dict, ...] = ()  # as SimulationInfo has them
-    field: tuple[dict, dict[str, PackedArray]] | None = None  # of `playable_parts`, for a page that simulates
+    dt: float  # time between frames [s]
+    forces: tuple[dict, ...] = ()  # as in SimulationInfo
+    field: tuple[dict, dict[str, PackedArray]] | None = None  # from `playable_parts`, for a page that simulates
 
     @classmethod
     def of(cls, t: Trajectory) -> Motion:
@@ -54,10 +54,10 @@ def pack_film(
     settings: Mapping = {},
     shadows: ShadowCaster | None = None,  # noqa: B006
 ) -> bytes:
-    """The container of a scene at rest or in motion, without the Gaussians that no picture shows.
+    """The container of a scene at rest or in motion, without Gaussians too transparent to be drawn.
 
     `settings` are passed on to the page: `view` {viewmat, K, size}, `target`, `colours`, `arrows`, `live`, `title`.
-    With `shadows` the page draws those of what moves.
+    With `shadows` the page draws the shadows of moving objects.
     """
     g = scene.gaussians.to("cpu")
     bound = torch.zeros(len(g), dtype=torch.bool) if motion is None else (motion.binding.index >= 0).any(1)
@@ -87,7 +87,7 @@ def pack_film(
 
 
 def _shadow_arrays(shadows: ShadowCaster, g: Gaussians) -> dict[str, PackedArray]:
-    """The spheres of the objects at rest with their binding, and the irradiance that the colours hold."""
+    """The spheres of the objects at rest with their binding, and the irradiance that is baked into the colours."""
     rest, binding = shadows.occluders.rest, shadows.occluders.binding
     return {
         "spheres": quantised(torch.cat([rest.centres, rest.radii[:, None]], 1), KEYPOINT_BITS),
@@ -103,7 +103,7 @@ def film_page(film: bytes, title: str) -> str:
     """The HTML file that plays a film from `pack_film`; it fetches nothing."""
     modules = {f"player/{file.name}": _data_url(file) for file in sorted(WEB.glob("*.js"))}
     parts = {
-        "TITLE": escape(title.encode(errors="replace").decode()),  # a file name need not be UTF-8
+        "TITLE": escape(title.encode(errors="replace").decode()),  # a file name need not be valid UTF-8
         "STYLE": (WEB / "style.css").read_text(encoding="utf-8"),
         "IMPORTS": json.dumps({"imports": modules}), "FILM": base64.b64encode(film).decode(),
     }  # fmt: skip
@@ -111,7 +111,7 @@ def film_page(film: bytes, title: str) -> str:
 
 
 def fill_template(template: str, parts: dict[str, str]) -> str:
-    """The text with every {{NAME}} replaced by its part."""
+    """The template with every {{NAME}} replaced by the part of that name."""
     before, *rest = template.split("{{")
     pieces = [piece.partition("}}") for piece in rest]
     return before + "".join(parts[name] + after for name, _, after in pieces)
@@ -122,7 +122,7 @@ def _data_url(file: Path) -> str:
 
 
 def _drawing_order(g: Gaussians, bound: Tensor) -> Int[Tensor, "m"]:
-    """Rows of the drawable Gaussians: those that follow keypoints first, by object, neighbours near each other."""
+    """Rows of the drawable Gaussians: those bound to keypoints first, then by object, then along a Morton curve."""
     finite = torch.stack([getattr(g, name).flatten(1).isfinite().all(1) for name in ("means", "quats", "scales", "sh")])
     rows = (finite.all(0) & (g.opacities >= MIN_DRAWN_OPACITY)).nonzero()[:, 0]
     x = g.means[rows].double()
@@ -156,7 +156,7 @@ def _gaussian_arrays(g: Gaussians) -> dict[str, PackedArray]:
 
 
 def _clipped(x: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-    """The values without extremes, which would widen the steps of all others."""
+    """The values with outliers clipped, which would coarsen the quantisation of all others."""
     if len(x) < 1000:
         return x
     thinned = x[:: 1 + len(x) // 100_000]
@@ -170,7 +170,7 @@ def _motion_arrays(motion: Motion, rows: Int[Tensor, "m"]) -> dict[str, PackedAr
     extents = [float((x.amax((0, 1)) - x.amin((0, 1))).max()) for x in (all_frames[:1], all_frames)]
     bits = bits_for(extents[1], extents[0] / 2**KEYPOINT_BITS)
     return {
-        # one grid for rest and frames, so that what does not move stays exactly at rest
+        # one quantisation grid for rest and frames, so that resting keypoints stay exactly at rest
         "keypoints": quantised(all_frames.flatten(1), bits, axes=3, delta=True),
         "keypoint_object": whole(keypoints.object_id[:, None]),
         "neighbours": whole(keypoint_neighbours(keypoints)),

@@ -1,4 +1,4 @@
-"""What a page needs to continue a motion of the learned field: the network, rest shapes, materials and units."""
+"""Data with which a page continues a motion of the learned field: network, rest shapes, materials and units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from stages.core.scene.trajectory import Trajectory
 
 
 def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
-    """Header entry `field` and arrays for `pack_film`. Raises InputError for motions of other engines."""
+    """Header entry `field` and arrays for `pack_film`. Raises InputError for a motion that the page cannot continue."""
     model = _model(t)
     start = t.field
     mine = [t.keypoints.object_id == o.id for o in t.scene.objects]
@@ -51,14 +51,14 @@ def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
 
 
 def _pull_range(t: Trajectory) -> tuple[tuple, tuple]:
-    """`pull_range` within the walls, which the file has in model units."""
+    """`pull_range` within the walls, which the file stores in model units."""
     units = t.field.units
     low, high = ((corner / units.length + torch.tensor(units.origin)).tolist() for corner in t.field.box[0])
     return pull_range(t.keypoints, (*low[:2], units.origin[2]), (*high[:2], high[2] - FLOOR / units.length))
 
 
 def _model(t: Trajectory) -> ForceField:
-    """The field that made the motion."""
+    """The network that made the motion. Raises InputError if the page cannot compute it, or other weights were used."""
     path: Path = t.path
     if t.info.engine != "ngff":
         raise InputError(f"{path}: was simulated by {t.info.engine}, and a page computes only the learned field; "
@@ -76,7 +76,7 @@ def _model(t: Trajectory) -> ForceField:
 
 
 def _initial_conditions(start: FieldStart, mine: list[Tensor]) -> InitialConditions:
-    """The start as a batch of one scene; `mine`: masks of the keypoints of each object."""
+    """The initial conditions as a batch of one scene; `mine` are masks of the keypoints of each object."""
     most = max(int(rows.sum()) for rows in mine)
 
     def padded(values: Tensor) -> Tensor:
@@ -90,7 +90,7 @@ def _initial_conditions(start: FieldStart, mine: list[Tensor]) -> InitialConditi
 
 
 def _of_keypoints(shape: RestShape, values: Tensor, mine: list[Tensor]) -> Tensor:
-    """Values of a batch of one scene in the order of the trajectory's keypoints."""
+    """Values of a batch of one scene, rearranged to the order of the trajectory's keypoints."""
     out = values.new_zeros(len(mine[0]), values.shape[-1])
     for row, rows in enumerate(mine):
         out[rows] = values[0, row, shape.initial.valid[0, row]]

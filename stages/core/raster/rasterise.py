@@ -1,11 +1,11 @@
 """Rasterisation of Gaussians on the CPU and on CUDA, with the conventions of gsplat.
 
-Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
-a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and features, not in cameras or
-background. Images and gradients are bit-identical when repeated on the same device, on the CPU for any number
-of threads.
+Pixel centres are at +0.5, the blur is 0.3 px^2, splats are sorted by camera depth, alpha is 1/255 to 0.999, and
+compositing of a pixel stops at a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and
+features, not in cameras or background. Images and gradients are bit-identical when repeated on the same device, on the
+CPU for any number of threads.
 
-A CPU for which Warp has no compiler leaves the work to a GPU; images are returned on the device of the Gaussians.
+If Warp has no compiler for the CPU, a GPU does the work; images are returned on the device of the Gaussians.
 """
 
 from __future__ import annotations
@@ -74,10 +74,10 @@ def rasterise_packed(
     gaussians: Gaussians, camera: Float[Tensor, "26"], width: int, height: int, background: Tensor | None = None,
     capacity: Capacity | None = None,
 ):  # fmt: skip
-    """One view with a camera from `pack_camera` on the device of the Gaussians: rgb (h, w, 3), alpha (h, w), depth
-    (h, w), extents (n, 2) and a getter of the absolute gradients, see `Rendering`.
+    """Render one view with a camera from `pack_camera` on the device of the Gaussians.
 
-    On CUDA, with a capacity for the pairs of a splat and a tile, nothing waits for the GPU, so that the call and its
+    Returns rgb (h, w, 3), alpha (h, w), depth (h, w), extents (n, 2) and a getter of the absolute gradients; see
+    `Rendering`. On CUDA, with a capacity for the splat-tile pairs, nothing waits for the GPU, so that the call and its
     gradient can be captured in a CUDA graph.
     """
     splats, bins = _splats(gaussians, camera, width, height, capacity)
@@ -90,7 +90,7 @@ def rasterise_packed(
 
 
 def count_pairs(gaussians: Gaussians, camera: Float[Tensor, "26"], width: int, height: int) -> int:
-    """The number of pairs of a splat and a tile in this view, on CUDA; see `Capacity`."""
+    """Number of splat-tile pairs in this view, on CUDA; see `Capacity`."""
     return len(_splats(gaussians, camera, width, height)[1].slots)
 
 
@@ -102,14 +102,14 @@ def rasterise_features(
     width: int,
     height: int,
 ) -> Float[Tensor, "c h w f"]:
-    """Composite feature vectors of the Gaussians like colours, over 0: sum of weight x feature. Differentiable."""
+    """Composite feature vectors of the Gaussians like colours, over 0: the sum of weight x feature. Differentiable."""
     g = _drawable(gaussians)
     views = [_View(V, K, width, height) for V, K in zip(viewmats, Ks, strict=True)]
     return _stack([_features(g, features.to(g.means.device), view) for view in views]).to(gaussians.means.device)
 
 
 class Visibility(NamedTuple):
-    """What one camera sees over black; rgb, alpha and depth as in `Rendering`."""
+    """What one camera sees over a black background; rgb, alpha and depth as in `Rendering`."""
 
     rgb: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
@@ -122,7 +122,7 @@ class Visibility(NamedTuple):
 def visibility(
     gaussians: Gaussians, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
 ) -> Visibility:
-    """Which Gaussians are seen in a view of this size [px], and its images. Not differentiable."""
+    """Find which Gaussians are visible in a view of this size [px], and render it. Not differentiable."""
     g = _drawable(gaussians)
     splats, bins = _splats(g, _View(viewmat, K, width, height).packed(g), width, height)
     rgb, depth, alpha, index, weight = composite_with_dominant(splats, bins)
@@ -130,7 +130,7 @@ def visibility(
 
 
 def _drawable(g: Gaussians) -> Gaussians:
-    """The Gaussians on their device, or on a GPU where no kernel can be compiled for the CPU."""
+    """The Gaussians on their device, or on a GPU if no kernel can be compiled for the CPU."""
     return g.to(kernel_device(g.means))
 
 
@@ -162,7 +162,10 @@ def _splats(
 
 
 def _features(g: Gaussians, features: Tensor, view: _View):
-    """Composite four features at a time in the columns of colour and depth, on a CPU where they are not all zero."""
+    """Composite four features at a time in the columns of colour and depth.
+
+    On a CPU without gradients, splats whose four features are all zero are skipped.
+    """
     splats, bins = _splats(g, view.packed(g), view.width, view.height)
     count = features.shape[1]
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))

@@ -38,7 +38,7 @@ class BruteForce:
     then chosen by their exact distances; for k = 1 the best candidate is taken without this step.
     """
 
-    MAX_ENTRIES = 2**26  # most entries of the distance matrix held at once, 256 MB
+    MAX_ENTRIES = 2**26  # maximum number of entries of the distance matrix held at once, 256 MB
     SPARE = 4  # candidates beyond k
 
     def __init__(self, points: Float[Tensor, "n d"]):

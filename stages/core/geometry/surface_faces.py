@@ -11,14 +11,14 @@ from scipy.spatial import cKDTree
 
 NEIGHBOURS = 6  # nearest points, including itself, whose normals decide whether a point is on a face
 OTHER_SIDE = -0.5  # cosine between two normals below which their points are on different sides of a sheet
-FACE_COSINE = 0.97  # least length of the mean normal around a point on a face; .71 at a cube's edge, .58 at a corner
+FACE_COSINE = 0.97  # minimum length of the mean normal around a point on a face; .71 at a cube's edge, .58 at a corner
 AROUND = 24  # nearest points among which the faces at an edge or a corner are searched
-SAME_FACE = 0.9  # least cosine between two normals of one face
+SAME_FACE = 0.9  # minimum cosine between two normals of one face
 NEAR = 4  # distance from the surface up to which a grid node gets its nearest point [grid spacing]
-FACES = 3  # most faces that meet at a point
-BETWEEN = 0.5  # least cosine between a point's normal and the nearest of its faces' normals; .58 at a cube's corners
-OPPOSED = 0.9  # least cosine between one face normal and the reverse of another at which two faces are parallel
-CURVED = 5e-4  # least difference of flatness that is significant; flatness of a plane 1, of a ball of 2000 points .998
+FACES = 3  # maximum number of faces that meet at a point
+BETWEEN = 0.5  # minimum cosine between a point's normal and the nearest of its faces' normals; .58 at a cube's corners
+OPPOSED = 0.9  # minimum cosine between one face normal and the reverse of another at which two faces are parallel
+CURVED = 5e-4  # minimum significant difference of flatness, which is 1 for a plane and .998 for a ball of 2000 points
 
 
 def surface_faces(
@@ -26,7 +26,7 @@ def surface_faces(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flatness (n,) of the surface at points (n, 3) with outward normals (n, 3), and normals (n, 3, 3) of the faces.
 
-    A point on a face has the normal of that face, any other those of up to three adjacent faces; unused rows are 0.
+    A point on a face has the normal of that face, other points those of up to three adjacent ones; unused rows are 0.
     Flatness is 1 in a plane, and 0 if a point is not on a face. Points `at_edge` (n,) are known not to be on a face,
     even if the neighbouring points coincide.
     """

@@ -26,10 +26,10 @@ def eigh(matrices: Float[Tensor, "b n n"]) -> tuple[Float[Tensor, "b n"], Float[
 
 
 def least_directions(matrices: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 3"]:
-    """Unit eigenvectors of the least eigenvalue of symmetric 3 x 3 matrices, given by their entries in PAIRS.
+    """Unit eigenvectors for the smallest eigenvalue of symmetric 3 x 3 matrices, given by their entries in PAIRS.
 
-    Computed in closed form, ten times as fast as LAPACK: with least eigenvalue l, the cross product of two rows of
-    M - l I. Source: Smith 1961, "Eigenvalues of a symmetric 3 x 3 matrix".
+    Computed in closed form, ten times as fast as LAPACK: the cross product of two rows of M - l I, where l is the
+    smallest eigenvalue. Source: Smith 1961, "Eigenvalues of a symmetric 3 x 3 matrix".
     """
     xx, yy, zz, xy, xz, yz = np.ascontiguousarray(matrices.T)
     mean = (xx + yy + zz) / 3

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def longest_side(points: Float[Tensor, "n 3"]) -> float:
-    """The longest side of the upright bounding box of least horizontal perimeter. Independent of the axes x and y.
+    """The longest side of the upright bounding box with minimum horizontal perimeter. Independent of the axes x and y.
 
     A side of this box contains a side of the convex hull of the points seen from above (Toussaint 1983, "Solving
     geometric problems with the rotating calipers").

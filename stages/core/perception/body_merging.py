@@ -14,10 +14,10 @@ from stages.core.scene.gaussians import Gaussians
 
 CELL_SIZE = 0.01  # side of the grid cells to which positions are thinned [camera distance]
 MAX_CONTACT_DISTANCE = 2.0  # largest distance between touching points of two parts [cells]
-MIN_MUTUAL_OVERLAP = 0.05  # least fraction of each of two interlocking parts inside the convex hull of the other
-MIN_CONTACT_FRACTION = 0.05  # least number of touching points of interlocking parts [fraction of the smaller part]
+MIN_MUTUAL_OVERLAP = 0.05  # minimum fraction of each of two interlocking parts inside the convex hull of the other
+MIN_CONTACT_FRACTION = 0.05  # minimum number of touching points of interlocking parts [fraction of the smaller part]
 MAX_STANDING_HEIGHT = 4.0  # height of its lowest points up to which a part stands on the table [support tolerances]
-MIN_BELOW_FRACTION = 0.25  # least fraction of a suspended part below its contact with another part
+MIN_BELOW_FRACTION = 0.25  # minimum fraction of a suspended part below its contact with another part
 
 
 @dataclass(frozen=True)

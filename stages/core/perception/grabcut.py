@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_fill_holes
 
-MIN_PIECE_FRACTION = 0.1  # least area of a connected piece of a mask, relative to the largest
+MIN_PIECE_FRACTION = 0.1  # minimum area of a connected piece of a mask, relative to the largest
 
 
 def grabcut(

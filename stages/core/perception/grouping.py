@@ -32,12 +32,12 @@ from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 MAX_VOXELS = 60_000
-MIN_VOXEL_DENSITY = 0.3  # least Gaussians per voxel of an object [median near the focus]; sparser ones are floaters
+MIN_VOXEL_DENSITY = 0.3  # minimum Gaussians per voxel of an object [median near the focus]; sparser ones are floaters
 MAX_BASE_HEIGHT = 0.4  # largest height above the table of an object's lowest point [camera distance]
 MAX_BUMP_HEIGHT = 0.05  # height up to which a region of the table's colour is a bump of the table [camera distance]
 MAX_TABLE_OBJECT = 0.4  # longest side of an object on a table [camera distance]
 MAX_WALL_OBJECT = 0.9  # longest side of an object on a wall, which often fills the photos [camera distance]
-MIN_GAUSSIANS_ABOVE = 20  # least Gaussians above the plane; with fewer there are no objects
+MIN_GAUSSIANS_ABOVE = 20  # minimum number of Gaussians above the plane; with fewer there are no objects
 
 
 def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:  # noqa: B008 -- frozen

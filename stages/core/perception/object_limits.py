@@ -8,7 +8,7 @@ class ObjectLimits:
     """What counts as an object."""
 
     max_objects: int = 24
-    min_size: float = 0.03  # least longest side of an object [distance of the cameras from what they look at]
+    min_size: float = 0.03  # minimum longest side of an object [distance of the cameras from what they look at]
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
 
 FAR = 1e9  # depth of pixels without a surface
-MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # least alpha of a surface, most alpha of an empty pixel; else unknown
+MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # minimum alpha of a surface, maximum of an empty pixel; else unknown
 MAX_HIDDEN_WEIGHT = 0.3  # largest weight in any view of a Gaussian that counts as hidden [px of the downscaled images]
-MIN_VIEWS_FOR_TWO = 6  # least number of cameras for which two must agree that a point is free
+MIN_VIEWS_FOR_TWO = 6  # minimum number of cameras for which two must agree that a point is free
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from stages.core.perception.support import Support, cell_medians, sliding_quanti
 from stages.core.scene.gaussians import Gaussians
 
 MIN_TABLE_DIFFERENCE = 12.0  # colour difference from the table above which a Gaussian is not table [CIELAB]
-MIN_CHROMA_DIFFERENCE = 20.0  # least difference in a and b that shading cannot cause [CIELAB]
-MAX_GROWTH_STEPS = 12  # most steps of `radius` by which an object grows along Gaussians near the table
+MIN_CHROMA_DIFFERENCE = 20.0  # difference in a and b above which shading cannot be the cause [CIELAB]
+MAX_GROWTH_STEPS = 12  # maximum number of steps of `radius` by which an object grows along Gaussians near the table
 
 
 def cielab_colours(g: Gaussians) -> Float[Tensor, "n 3"]:

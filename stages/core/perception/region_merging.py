@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 TEXTURE_CONTRAST = 9.0  # colour difference of neighbouring voxels up to which it counts as texture [CIELAB]
-MAX_SAMPLE_POINTS = 150  # most points of a region that are tested against convex hulls
+MAX_SAMPLE_POINTS = 150  # maximum number of points of a region that are tested against convex hulls
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from stages.core.scene.scene import Scene
 
 SEARCH_RADIUS = 1.5  # distance from the focus within which Gaussians are examined [camera distance]
 GRID_CELLS = 300  # cells along a side of the grid over the surface
-MAX_QUANTILE_POINTS = 100_000  # most points that a quantile of distances is computed from
+MAX_QUANTILE_POINTS = 100_000  # maximum number of points that a quantile of distances is computed from
 
 
 @dataclass(frozen=True)

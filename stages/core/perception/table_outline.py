@@ -22,11 +22,11 @@ from stages.core.scene.scene import Scene
 
 # Lengths are in camera distances. MIN_DROP to MIN_KNOWN were chosen on the scenes kitchen, kermit, the desk and banana,
 # whose carpet has no edge. A view knows a cell if its pixel shows the cell or a surface behind it.
-MIN_DROP = 0.05  # least distance along the ray from the table to a surface seen past it
-MIN_VIEWS = 3  # least views that must know a cell
+MIN_DROP = 0.05  # minimum distance along the ray from the table to a surface seen past it
+MIN_VIEWS = 3  # minimum number of views that must know a cell
 STRIP, GAP, NEAR = 0.1, 0.01, 0.03  # width of the strip beyond an edge, its distance from the edge, depth of the edge
 MIN_SEEN_PAST = 0.8  # fraction of the known cells in the strip past which cameras must look
-MIN_KNOWN = 0.25  # least fraction of known cells in the strip
+MIN_KNOWN = 0.25  # minimum fraction of known cells in the strip
 
 MIN_SHARE = 0.5  # fraction of the views that know a cell above which cameras look past it
 DIRECTIONS = 72  # candidate normals of the edges, at equal angles

@@ -20,13 +20,13 @@ from stages.core.perception.voting import ViewFootprint, add_votes, damp_votes, 
 from stages.core.raster.rasterise import rasterise_features
 from stages.core.scene.scene import Scene
 
-MAX_VIEWS = 16  # most views used, evenly spaced among the cameras
+MAX_VIEWS = 16  # maximum number of views used, evenly spaced among the cameras
 BAND = 0.01  # distance from the current outline within which the new one is searched [camera distance]
-MIN_VOTES = 1.0  # least votes of a Gaussian that changes its object; hidden Gaussians have fewer
+MIN_VOTES = 1.0  # minimum votes of a Gaussian that changes its object; hidden Gaussians have fewer
 CONTEXT = 3.0  # width of the surroundings with which an object's colours are compared [BAND]
 REACH = 0.03  # largest distance of a Gaussian that an object gains from its previous Gaussians [camera distance]
-MIN_PIXELS = 40  # least pixels of an object in a view for its outline to be refined
-MIN_KEPT = 0.4  # least fraction of its pixels that an object keeps; if fewer remain, colour does not separate it
+MIN_PIXELS = 40  # minimum number of pixels of an object in a view for its outline to be refined
+MIN_KEPT = 0.4  # minimum fraction of its pixels that an object keeps; if fewer remain, colour does not separate it
 
 
 def refine_outlines(

@@ -12,7 +12,7 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 
 MAX_VISIBILITY_SIDE = 320  # longest side of the images in which visibility is rendered [px]
-MAX_VISIBILITY_VIEWS = 24  # most cameras for which visibility is rendered
+MAX_VISIBILITY_VIEWS = 24  # maximum number of cameras for which visibility is rendered
 
 
 def downscaled_views(

@@ -24,7 +24,7 @@ MAX_VOTING_SIDE = 640  # longest side of the images in which votes are counted [
 POOLED_NEIGHBOURS = 8  # neighbours whose votes are added to those of a Gaussian
 SURFACE_TOLERANCE = 0.02  # distance from the rendered surface up to which a Gaussian is on it [fraction of its depth]
 MAX_SPACING = 3.0  # largest distance of neighbours that are used [median spacing]
-MAX_SPACING_POINTS = 20_000  # most Gaussians from which the median spacing is estimated
+MAX_SPACING_POINTS = 20_000  # maximum number of Gaussians from which the median spacing is estimated
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from stages.core.perception.support import SEARCH_RADIUS, ViewExtent, is_opaque
 from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
 
-MIN_WALL_FRACTION = 0.2  # least fraction of the Gaussians in focus that lie on a wall
+MIN_WALL_FRACTION = 0.2  # minimum fraction of the Gaussians in focus that lie on a wall
 MAX_BEHIND_FRACTION = 0.05  # largest fraction of the Gaussians in focus that lie behind a wall
-MIN_EXTENT = 0.8  # least extent of a wall, both vertically and horizontally [camera distance]
+MIN_EXTENT = 0.8  # minimum extent of a wall, both vertically and horizontally [camera distance]
 MAX_NORMAL_Z = 0.5  # largest |z| of a wall's unit normal; above it, the plane is a ramp
 WALL_THICKNESS = 0.02  # [camera distance]
 

@@ -29,15 +29,15 @@ HIDDEN = -0.5  # vertical component of the directions below which photos do not 
 NEIGHBOURS = 7  # directions over which a median is taken: one and those around it
 # Lengths are in radii. The limits were chosen on the reconstructions and exact shapes listed in
 # stages/lab/results/physics.md.
-# (largest difference from the radius, least fraction of directions within it): an icosahedron has up to .65 within .01,
-# an egg of 1:1.1 up to .49; a pear .86 within .06
+# (largest difference from the radius, minimum fraction of directions within it): an icosahedron has up to .65 within
+# .01, an egg of 1:1.1 up to .49; a pear .86 within .06
 SHARES = ((0.01, 0.75), (0.06, 0.95))
 DENT = 0.25  # largest distance of the surface inside the ball: a flat face where photos do not show the surface
 SUNK = 0.1  # largest depth of the ball in the floor or another object, and height of its bottom above the lowest point
 SKIRT = 2**0.5 - 1  # largest distance of the surface outside the ball: the edge of an upright cylinder below it
 CONVERGED = 1e-4  # length of a step below which the fit has converged
-MAX_STEPS = 20  # most steps of the fit; fits to balls take about five
-MAX_POINTS = 4000  # most points used: 20 per direction
+MAX_STEPS = 20  # maximum number of steps of the fit; fits to balls take about five
+MAX_POINTS = 4000  # maximum number of points used: 20 per direction
 
 
 @dataclass(frozen=True)

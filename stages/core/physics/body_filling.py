@@ -16,10 +16,10 @@ from scipy import ndimage
 
 from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded, within
 
-MIN_PARTICLES = 40  # least particles of an object
+MIN_PARTICLES = 40  # minimum number of particles of an object
 MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the leaks in shells that are sealed [voxels]
-MIN_CAVITY_RATIO = 1.5  # least half width of a cavity relative to that of its leaks
+MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 STRAY = 0.01  # tolerated fraction of an object's points below it, and of its filled voxels with points of other objects
 UNDERSIDE = 0.02  # quantile of the points' heights at which an unseen underside is closed: walls are ragged below it
 FULLER = 1.5  # closing the underside must increase the volume by this factor: then it turns a shell into a solid

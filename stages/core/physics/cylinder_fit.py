@@ -1,8 +1,9 @@
 """Fit a solid cylinder to the surface of a convex object, and decide whether the object is one.
 
-The cylinder of least mean absolute distance to the surface points is fitted from several initial axes: the principal
-directions of the points, and of the normals of their convex hull weighted by area. One of these is the axis: the
-principal directions are undetermined for the points only at a height of 1.7 radii, and for the normals only at 2 radii.
+The mean absolute distance of the surface points from the cylinder is minimised, starting from several axes: the
+principal directions of the points, and of the area-weighted normals of their convex hull. For a cylinder, one of these
+is its axis: the principal directions of the points are undetermined only at a height of 1.7 radii, those of the normals
+only at 2 radii.
 
 As for balls (`ball_fit.py`), reconstruction noise varies from place to place while the deviation of another shape does
 not. The median distance over neighbouring points must therefore be small on the curved side and on each end; each part
@@ -23,8 +24,8 @@ from stages.core.kernels.threads import small_operations
 from stages.core.physics.ball_fit import CONVERGED, MAX_POINTS, MAX_STEPS, SHARES
 
 NEIGHBOURS = 20  # points over which the median distance is taken, as many as per direction of a ball
-FILLED = 0.9  # least fraction of the cylinder that the hull fills; a prism of twelve sides fills .95
-MIN_POINTS = 4  # least points on the curved side and on each end: three always lie on one plane
+FILLED = 0.9  # minimum fraction of the cylinder that the hull fills; a prism of twelve sides fills .95
+MIN_POINTS = 4  # minimum number of points on the curved side and on each end: three always lie on one plane
 Vector = Float[np.ndarray, "3"]
 
 
@@ -93,9 +94,9 @@ def _principal_axes(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
 
 
 def _least_absolute_distances(points: np.ndarray, axis: np.ndarray) -> Cylinder | None:
-    """The cylinder of least mean absolute distance to the points, starting from `axis`; None if it shrinks to nothing.
+    """Minimise the mean absolute distance of the points from a cylinder, from this axis; None if it shrinks to nothing.
 
-    Minimised by iteratively reweighted Gauss-Newton steps.
+    By iteratively reweighted Gauss-Newton steps.
     """
     frame = np.concatenate([_across(axis), axis[None]])
     ends = np.stack([(points @ frame.T).min(0), (points @ frame.T).max(0)])

@@ -123,7 +123,7 @@ ALIASES = {  # material of objects whose name contains one of these words
     "fruit": ["apple", "banana", "orange", "lemon", "pear"],
     "ball": ["soccer", "football", "basketball"],
 }
-MAX_PARTS = 100  # most parts of an object
+MAX_PARTS = 100  # maximum number of parts of an object
 REGION = ("below", "box", "segment")  # keys that give the region of a part
 DEFAULT_MATERIAL = "common"  # for objects whose name suggests no material
 

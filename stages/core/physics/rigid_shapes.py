@@ -23,11 +23,11 @@ from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-CONVEX = 0.9  # least fraction of its hull that a convex object fills; volumes of voxels are accurate to about 5 %
+CONVEX = 0.9  # minimum fraction of its hull that a convex object fills; volumes of voxels are accurate to about 5 %
 MAX_VERTICES = 200  # of a hull: approximates an egg to 1 %
 THIN = 4.0  # mean hull thickness below which the volume of voxels is too inaccurate for CONVEX [voxels]
 COVERED = 1.5  # distance from the nearest voxel of the body up to which a point on a thin hull is covered [voxels]
-COVER = 0.98  # least fraction of the surface of a thin hull that is covered if the object fills it
+COVER = 0.98  # minimum fraction of the surface of a thin hull that is covered if the object fills it
 HULL_SUBSET = 2000  # points whose hull is tested first: an object that does not fill it fills no larger hull
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1

@@ -1,6 +1,6 @@
 """Signed distance to the surface of a body on a grid, from points on the surface.
 
-The surface is represented by surfels: discs through the points, normal to the direction of least variance of their
+The surface is represented by surfels: discs through the points, normal to the direction of smallest variance of their
 neighbourhood. The outward side of a disc is the one from which more rays escape; a disc with two open sides is part of
 a sheet. Few rays pass through holes in the surface, so small holes do not open a side. The distance of a grid node is a
 weighted mean of the distances to the nearest discs that face the same way, so flat faces stay flat and edges sharp.
@@ -24,8 +24,8 @@ RESOLUTION = 36  # nodes of the grid along each axis
 MARGIN = 4  # width of the grid around the body [cells]
 NORMAL_NEIGHBOURS = 12  # surface points that determine a normal
 BLENDED = 6  # nearest discs whose distances are averaged
-MAX_SURFELS = 6_000  # most surface points used; more make no difference at this resolution
-SAME_FACE = 0.5  # least cosine of the angle between the normals of discs that are averaged
+MAX_SURFELS = 6_000  # maximum number of surface points used; more make no difference at this resolution
+SAME_FACE = 0.5  # minimum cosine of the angle between the normals of discs that are averaged
 OVERLAP = 2.0  # factor by which discs are enlarged, so that randomly spaced discs cover the surface without holes
 SURFACE = 0.75  # distance to a disc up to which a node blocks rays [cells]
 PROBE = 1.5  # distance from a disc at which the rays of either side start [cells]

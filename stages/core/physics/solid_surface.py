@@ -22,12 +22,12 @@ from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 48  # number of voxels along the side of a cube-shaped object
-MIN_SLOPE = 0.12  # least occupancy gradient that defines a normal [1/voxel]; .4 at the face of a thick body
+MIN_SLOPE = 0.12  # minimum occupancy gradient that defines a normal [1/voxel]; .4 at the face of a thick body
 SLENDER = 16  # ratio of longest to shortest side above which voxels get no smaller
-MOST_ALONG = 96  # most voxels along an object larger than the others: its accuracy matches theirs at contacts
+MOST_ALONG = 96  # maximum voxels along an object larger than the others: its accuracy matches theirs at contacts
 BARE = 3.0  # distance from the nearest Gaussian above which a voxel face is a sample [voxels, at least 1/3 spacing]
 NEAREST = 8  # nearest samples whose tangent planes are averaged for a distance
-SAME_FACE = 0.8  # least cosine between the normals of two samples on the same face
+SAME_FACE = 0.8  # minimum cosine between the normals of two samples on the same face
 NEIGHBOURS = 16  # nearest samples to which a tangent plane is fitted
 MIN_ON_FACE = 6  # neighbours of similar normal below which a plane fit starts from all that face the same way
 FITS = 4  # iterations of the reweighted plane fit

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MAX_BITS = 24  # most bits of an integer that is exact in the float32 of the page
+MAX_BITS = 24  # maximum bits of an integer that the page's float32 represents exactly
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from stages.core.errors import InputError
 from stages.core.scene.formats import format_of
 from stages.core.scene.schema import read_json, reason
 
-KEPT_OF_NAME = 50  # most characters of a file's name in the name of its temporary file; names have up to 255 bytes
+KEPT_OF_NAME = 50  # characters of a file's name kept in the name of its temporary file; names have up to 255 bytes
 _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _count = itertools.count()
 _swept: set[Path] = set()  # folders from which this process has removed the files of killed processes

@@ -23,7 +23,7 @@ ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # message types of an object header
 # VARIABLE_LENGTH with the bits TEXT. HDF5 may crash on damaged attributes of other classes; ngff writes none of these.
 NUMBER, FLOAT, FIXED_TEXT, ENUMERATION, VARIABLE_LENGTH, TEXT = 0, 1, 3, 8, 9, 1
 HEAP = b"GCOL\x01\0\0\0"  # signature and version of a global heap
-MAX_BLOCKS = 1000  # most blocks of an object header
+MAX_BLOCKS = 1000  # maximum number of blocks of an object header
 
 
 def check_texts(data: h5py.Dataset) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from stages.core.scene.schema import MAX_DEFLATE_RATIO
 
-MAX_PIXELS = 1 << 27  # most pixels of an image, 134 million
+MAX_PIXELS = 1 << 27  # maximum number of pixels of an image, 134 million
 MAX_RATIO = 4096  # largest ratio of uncompressed to stored bytes in formats other than PNG; JPEG reaches 1500
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # number of channels by colour type
 JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # start-of-frame markers: all but DHT, JPG and DAC

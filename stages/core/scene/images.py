@@ -26,9 +26,9 @@ log = logging.getLogger(__name__)
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our own errors say the same in one line
 IGNORE_LABEL = 255  # value of pixels in label images that are not evaluated
 MAX_IMAGE_BYTES = 1 << 30  # largest image file [bytes]
-MAX_VIDEO_PIXELS = 1 << 26  # most pixels of a video frame; 8K has half as many
+MAX_VIDEO_PIXELS = 1 << 26  # maximum number of pixels of a video frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, because the encoded file depends on the number of threads
-MAX_PENDING_FRAMES = 8  # most video frames that wait for the encoder
+MAX_PENDING_FRAMES = 8  # maximum number of video frames that wait for the encoder
 
 
 def list_photos(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.schema import MAX_DEFLATE_RATIO, quote, reason
 
-MAX_BYTES = 16 << 30  # most bytes of all arrays together
+MAX_BYTES = 16 << 30  # maximum size of all arrays together [bytes]
 
 
 def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:

@@ -16,8 +16,8 @@ MAX_JSON_BYTES, MAX_JSON_DEPTH = 256 << 20, 100
 MAX_OBJECT_ID = 65535  # label images have 16 bits
 LARGEST = 1e9  # largest coordinate or size [scene units]; squares stay far below the limit of float32
 MAX_DEFLATE_RATIO = 1100  # largest ratio of uncompressed to compressed bytes; deflate reaches 1032
-MAX_QUOTED = 80  # most characters of a quoted value in messages
-MAX_ROWS = 10**6  # most entries of a list that a user writes
+MAX_QUOTED = 80  # maximum number of characters of a quoted value in messages
+MAX_ROWS = 10**6  # maximum number of entries of a list that a user writes
 Bound = int | float
 PLY_WIDTHS = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
               "double": 8, "float64": 8}  # [bytes]; other types have 4  # fmt: skip

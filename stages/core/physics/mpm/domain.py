@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MAX_NODES = 60_000_000  # most grid nodes of a scene: about 1 GB of address space per copy of the grid
+MAX_NODES = 60_000_000  # maximum number of grid nodes of a scene: about 1 GB of address space per copy of the grid
 
 
 @dataclass(frozen=True)

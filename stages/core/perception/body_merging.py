@@ -30,7 +30,7 @@ class ObjectPart:
 
     @classmethod
     def of(cls, means: Float[Tensor, "n 3"], support: Support) -> ObjectPart:
-        """The part with these finite means."""
+        """The part with Gaussians at these means, which must be finite."""
         side = CELL_SIZE * support.view.radius
         _, first = np.unique((means / side).floor().numpy(), axis=0, return_index=True)
         thin = means[first]

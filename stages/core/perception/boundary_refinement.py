@@ -137,7 +137,7 @@ def _cost(near: BoundaryRegion, border: Int[Tensor, "b"], label: int) -> Float[T
         return torch.full((len(border),), FORBIDDEN)
     distance, index = knn(near.points[core], near.points[border], COLOUR_SAMPLES)
     likelihood = _similarity(near.lab[border], near.lab[core[index]]).mean(1)
-    if label == 0:  # a patch of table next to the object may have its core elsewhere
+    if label == 0:  # the nearest reliable table may differ in colour from the table next to the object
         samples = near.lab[core[:: max(1, len(core) // TABLE_COLOUR_SAMPLES)]]
         likelihood = torch.maximum(likelihood, _similarity(near.lab[border], samples[None]).mean(1))
     cost = height - (likelihood + MIN_COLOUR_LIKELIHOOD).log()

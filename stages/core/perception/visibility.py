@@ -30,7 +30,7 @@ def downscaled_views(
 
 
 def summed_view_directions(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
-    """Sum over cameras of the unit direction to the camera times the Gaussian's weight in its image [px].
+    """Sum over the cameras of the unit direction to the camera, weighted by the Gaussian's weight in its image [px].
 
     Zero if no camera sees the Gaussian. The direction estimates the outer side of a surface, the length how much of the
     Gaussian is visible.

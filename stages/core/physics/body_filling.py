@@ -63,7 +63,7 @@ def closed_body(cloud: SurfaceCloud, h: float, floor: float | None) -> tuple[np.
     body = filled(None, LEAK_RADII, widest)
     lowest = margin if floor is None else max(margin, int(np.floor(floor / h)) - int(low[2]))
     if floor is not None:
-        # only leaks just wider than the closing: folds of a cloth on the floor would look like cavities with wide leaks
+        # seal only leaks just wider than the closing; otherwise folds of a cloth on the floor would count as cavities
         body = max(body, filled(lowest, (bridge + 1,)), key=np.count_nonzero)
     most = np.logical_or.accumulate(shell[:, :, : margin - 1 : -1], 2).sum()  # upper bound of the filled volume
     if others is not None and most > FULLER * body.sum():

@@ -55,8 +55,8 @@ class ForcePrompts:
     """Forces and constraints given by the user, by object id; false if there are none."""
 
     forces: tuple[Force, ...] = ()
-    pinned: frozenset[int] = frozenset()  # from the start
-    velocity: dict[int, Vector] = field(default_factory=dict)  # at the start [scene units/s]
+    pinned: frozenset[int] = frozenset()  # objects held from the start
+    velocity: dict[int, Vector] = field(default_factory=dict)  # initial velocity [scene units/s]
     lift: dict[int, float] = field(default_factory=dict)  # initial displacement upwards [scene units]
     changes: tuple[Change, ...] = ()
 

@@ -105,7 +105,7 @@ def nearest_weights(
     have = min(k, len(points))
     radius = distance[:, -1:] if len(points) > k else 1.5 * distance[:, have - 1 : have]
     weight = (1 - (distance[:, :k] / radius.clamp_min(1e-30)).square()).clamp_min(0).square()
-    weight[:, have:] = 0  # repeated points
+    weight[:, have:] = 0  # surplus columns repeat the last point
     weight = torch.where(weight.sum(1, keepdim=True) > 0, weight, (torch.arange(k) < have).to(weight).expand_as(weight))
     return index[:, :k], weight / weight.sum(1, keepdim=True)
 

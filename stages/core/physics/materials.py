@@ -34,8 +34,8 @@ class Material:
     E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
     nu: float = 0.3  # Poisson's ratio
-    friction: float = 0.5
-    loss: float = 0.1
+    friction: float = 0.5  # Coulomb coefficient
+    loss: float = 0.1  # loss factor, see the module docstring
     model: str = "neo-hookean"  # key of MODELS
     plastic: Triple = (0.0, 0.0, 0.0)  # parameters of the model, see MODELS
     source: str = "given by the user"

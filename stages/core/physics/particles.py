@@ -46,8 +46,8 @@ MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gau
 START = 0.25  # position of the object's lower bounds within the first voxel [voxels]
 CLOSED = 1.5  # largest gap between evenly spaced Gaussians [their spacing]: the diagonal of a square of four is 1.41
 AROUND = 4  # number of neighbours at equal distance in a square lattice
-MEDIAN_AROUND = gammaincinv(AROUND, 0.5)  # median of pi density distance^2 to the fourth neighbour, Poisson process
-RANDOM = (math.log(2) / MEDIAN_AROUND) ** 0.5  # ratio of median distances to the first and fourth neighbour, likewise
+MEDIAN_AROUND = gammaincinv(AROUND, 0.5)  # median of pi density distance^2 to the fourth of random neighbours
+RANDOM = (math.log(2) / MEDIAN_AROUND) ** 0.5  # ratio of median distances to the first and fourth of random neighbours
 ON_FLOOR = 4  # gap up to which an object stands on the floor [voxels]
 BASE = 0.1  # a body's base reaches up to ON_FLOOR voxels above this quantile of its voxels' heights
 
@@ -129,7 +129,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     Raises InputError for an object without any usable Gaussian.
     """
     good = _usable(scene, object_id)
-    if not len(good):  # use the centres of all its Gaussians that are finite
+    if not len(good):  # fall back to all finite centres
         mine = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu()
         means = mine[mine.isfinite().all(1)]
         if not len(means):
@@ -247,7 +247,7 @@ def _spacing(means: Float[Tensor, "n 3"], neighbour: int = 1) -> float:
 
 
 def largest_hole(means: Float[Tensor, "n 3"]) -> float:
-    """Expected width of the largest hole between Gaussians spread evenly or at random over a closed surface.
+    """Width of the largest hole to be expected between Gaussians spread evenly or at random over a closed surface.
 
     Random points leave much wider holes than a lattice of equal density: of the 2 n circles through three of n points
     with no other point inside, the fraction (1 + x) exp(-x) is larger than x / pi times the area per point (Miles 1970,

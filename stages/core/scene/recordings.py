@@ -37,7 +37,7 @@ def _is_recording(path: Path) -> bool:
 def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
     """Frame rate of all videos [1/s], or `fps` for folders of frames.
 
-    Raises InputError if the rates differ, or a video does not say its own.
+    Raises InputError if the rates differ, or a video does not state its rate.
     """
     rates = {name: video_info(path)[1] if path.is_file() else fps for name, path in recordings.items()}
     for name, rate in rates.items():

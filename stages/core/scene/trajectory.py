@@ -45,7 +45,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "keypoints/rest": Dataset("p 3"),
     "keypoints/object_id": Dataset("p", "int", 0, MAX_OBJECT_ID),
     "keypoints/positions": Dataset("t p 3"),
-    "binding/index": Dataset("b j", "int", -1),  # b is n unless there are dense frames
+    "binding/index": Dataset("b j", "int", -1),  # b equals n unless there are dense frames
     "binding/weight": Dataset("b j", low=-1e-3, high=1.001),
     "cameras/viewmats": Dataset("c 4 4"),
     "cameras/Ks": Dataset("c 3 3"),

@@ -54,7 +54,7 @@ class SplitSubsteps:
         self._nearest = torch.full((keys,), int(NONE), dtype=torch.int64, device=self.device)
         columns = {"velocity": self._velocity, "momentum": self._momentum, "friction": self._friction}
         self._nodes = with_arrays(NodeArrays(), columns)
-        self._nodes.nearest = view(self._nearest)  # with_arrays would take it as 32-bit numbers
+        self._nodes.nearest = view(self._nearest)  # with_arrays would treat it as 32-bit numbers
         self._active = with_arrays(ActiveBlocks(), {"stale": self._stale})
         self._blocks = torch.zeros(0, 2, dtype=torch.int32, device=self.device)
 

@@ -1,9 +1,8 @@
 """Numerical kernels in Warp, Triton and C++, and the PyTorch code that specifies them.
 
-Three tools: Warp compiles kernels for CPUs and GPUs. On CPUs the inner loops are C++ with SIMD vector types, given to
-Warp as strings (`wp.func_native`), since Warp does not vectorise across the threads of a launch. Triton, which needs a
-GPU, is used for the fused inference step of the force field; its modules are imported only where
-`compilers.TRITON` is true.
+Warp compiles kernels for CPUs and GPUs. Warp does not vectorise across the threads of a launch, so the inner loops on
+CPUs are C++ with SIMD vector types, passed to Warp as strings (`wp.func_native`). Triton, which needs a GPU, is used
+for the fused inference step of the force field; its modules are imported only where `compilers.TRITON` is true.
 
 | file                          | written in                  | specified and tested by                              |
 |-------------------------------|-----------------------------|------------------------------------------------------|
@@ -47,7 +46,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 |   deformation_features        |                             |                                                      |
 
 `interop` passes tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches in parallel;
-`operators` hides kernels from torch.compile; `compilers` says which compilers are there;
-`simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
-`physics` and `models` are the callers.
+`operators` hides kernels from torch.compile; `compilers` tells which compilers are available;
+`simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code shared by several kernels. The kernels are
+called by `raster`, `physics` and `models`.
 """

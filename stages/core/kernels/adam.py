@@ -1,7 +1,7 @@
-"""A step of the optimiser Adam on one tensor: one fused pass on any device.
+"""One step of the Adam optimiser on a single tensor, as one fused pass on any device.
 
-PyTorch's own fused step is used on the CPU. On CUDA it launches few blocks for a single large tensor, which takes ten
-times as long as this kernel.
+The CPU uses PyTorch's fused step. On CUDA that step launches only a few blocks for a single large tensor and takes ten
+times as long as the kernel here.
 
 Source: Kingma and Ba 2015, "Adam: a method for stochastic optimization", algorithm 1.
 """
@@ -20,7 +20,7 @@ from stages.core.kernels.interop import device_of, launch, view
 wp.set_module_options({"enable_backward": False})
 
 BETA1, BETA2 = 0.9, 0.999
-EPSILON = 1e-15  # as in 3D Gaussian splatting: gradients of one splat are small
+EPSILON = 1e-15  # as in 3D Gaussian splatting: the gradient of a single splat is small
 
 
 @wp.kernel
@@ -41,24 +41,24 @@ def _step(
 
 @dataclass
 class Moments:
-    """State of Adam for one tensor: running means of the gradient and of its square."""
+    """Adam's state for one tensor: running means of the gradient and of its square."""
 
     first: Tensor
     second: Tensor
 
     @classmethod
     def like(cls, value: Tensor) -> Moments:
-        """The moments of a tensor before its first step: zeros."""
+        """Return the moments of a tensor before its first step: zeros."""
         zeros = torch.zeros_like(value.detach())
         return cls(zeros, zeros.clone())
 
 
 @torch.no_grad()
 def adam_step(value: Tensor, grad: Tensor, moments: Moments, rate: Tensor, steps: Tensor) -> None:
-    """Change `value` and its moments in place by one step with this learning rate (1,), the `steps`-th (1,).
+    """Update `value` and its moments in place by one step.
 
-    All are on one device. On CUDA nothing waits for the GPU, and steps and rate can change between replays of a CUDA
-    graph.
+    `rate` (1,) is the learning rate, `steps` (1,) the number of this step, counted from 1. All tensors are on one
+    device. On CUDA the call does not synchronise, and `steps` and `rate` may change between replays of a CUDA graph.
     """
     grad = grad.contiguous()
     if not value.is_cuda:

@@ -1,7 +1,8 @@
-"""Agglomerative clustering of a sparse graph by average linkage: the closest two clusters merge until no edge is left.
+"""Agglomerative clustering of a sparse graph by average linkage.
 
-A merge joins the edges of the smaller list to the larger one. Edges wait in a heap in which they keep their place, so
-that those that change move and those that vanish leave no trace.
+The two clusters with the largest mean edge weight merge until no edge is left. A merge moves the edges of the cluster
+of lower degree to the other one. Edges are kept in an indexed binary heap, so that an edge whose weight changes is
+moved and an edge that disappears is removed, without stale entries.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from stages.core.kernels.interop import compiles_for_cpu, launch, view, with_arr
 
 wp.set_module_options({"enable_backward": False})
 
-# A half-edge h = 2 e + side is in the list of cluster ends[h]; ends[h ^ 1] is the cluster at its other side.
+# Half-edge h = 2 e + side is in the linked list of cluster ends[h]; ends[h ^ 1] is the cluster at the other end of
+# edge e.
 _MERGE = r"""
 const int clusters = graph.first.shape[0], edges = graph.heap.shape[0];
 int *ends = graph.ends.data, *next = graph.next.data, *first = graph.first.data, *degree = graph.degree.data;
@@ -94,19 +96,19 @@ count.data[0] = merges;
 
 @wp.struct
 class ClusterGraph:
-    """Clusters (n,) and the edges (m,) between them, as they merge."""
+    """State of the clustering: n clusters and the m edges between them."""
 
-    ends: wp.array2d[int]  # (m, 2)
-    sum: wp.array[wp.float64]  # (m,), of the weights
-    number: wp.array[int]  # (m,) of weights
-    mean: wp.array[wp.float64]  # (m,)
-    heap: wp.array[int]  # (m,)
-    place: wp.array[int]  # (m,) in the heap; -1: merged
-    next: wp.array[int]  # (2 m,), in the list of half-edges of a cluster
-    first: wp.array[int]  # (n,), of that list
-    degree: wp.array[int]  # (n,)
-    node: wp.array[int]  # (n,), of the tree
-    edge_to: wp.array[int]  # (n,), from the cluster that grows; -1: none
+    ends: wp.array2d[int]  # (m, 2) clusters at both ends of each edge
+    sum: wp.array[wp.float64]  # (m,) sum of the weights merged into each edge
+    number: wp.array[int]  # (m,) number of these weights
+    mean: wp.array[wp.float64]  # (m,) sum / number, the key of the heap
+    heap: wp.array[int]  # (m,) edges in heap order
+    place: wp.array[int]  # (m,) position of each edge in the heap; -1: removed
+    next: wp.array[int]  # (2 m,) next half-edge in the list of the same cluster
+    first: wp.array[int]  # (n,) first half-edge in the list of each cluster
+    degree: wp.array[int]  # (n,) number of edges of each cluster
+    node: wp.array[int]  # (n,) node of the merge tree that each cluster stands for
+    edge_to: wp.array[int]  # (n,) edge from the growing cluster to each cluster; -1: none
 
 
 @wp.func_native(_MERGE)
@@ -121,10 +123,13 @@ def _merge(graph: ClusterGraph, children: wp.array2d[int], merged: wp.array[int]
 def average_linkage(
     clusters: int, ends: Int[Tensor, "m 2"], sums: Float[Tensor, "m"], numbers: Int[Tensor, "m"]
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, "k"], Int[Tensor, "k"]]:
-    """The merges of that many clusters: the two nodes of each, and the sum and the number of the weights between them.
+    """Cluster a graph by average linkage.
 
-    Edges `ends`, each once and no loop, have the sums of so many weights. The two clusters with the largest mean merge
-    first; merge k makes node clusters + k. All tensors are on the CPU, as it is one thread's work.
+    `clusters` is the number of initial clusters. Edges `ends` are unique and have no loops; `sums` and `numbers` are
+    the sum and the count of the weights of each edge. The two clusters with the largest mean weight merge first.
+
+    Returns the two tree nodes that each merge joins, and the sum and the count of the weights between them; merge k
+    creates node `clusters` + k. All tensors are on the CPU, since the algorithm is sequential.
     """
     if not compiles_for_cpu():
         return average_linkage_reference(clusters, ends, sums, numbers)
@@ -150,11 +155,11 @@ def average_linkage_reference(
         links[a][b] = links[b][a] = (w, n)
     queue = [(-w / n, a, b) for a, row in enumerate(links) for b, (w, n) in row.items() if a < b]
     heapq.heapify(queue)
-    node, merges = list(range(clusters)), []  # node[i]: what stands in slot i
+    node, merges = list(range(clusters)), []  # node[i]: tree node of the cluster in slot i
     while queue:
         value, a, b = heapq.heappop(queue)
         found = links[a].get(b) if links[a] is not None and links[b] is not None else None
-        if found is None or -found[0] / found[1] != value:  # merged, or changed since it was queued
+        if found is None or -found[0] / found[1] != value:  # stale entry: the edge was merged or its weight changed
             continue
         if len(links[a]) < len(links[b]):
             a, b = b, a

@@ -1,4 +1,4 @@
-"""Kernel launches as CUDA graphs."""
+"""Capture of kernel launches as CUDA graphs."""
 
 import gc
 from collections.abc import Callable
@@ -7,14 +7,14 @@ import torch
 
 
 def captured(work: Callable[[], object], **options) -> torch.cuda.CUDAGraph:
-    """What `work` launches as a CUDA graph, with the options of `torch.cuda.graph`.
+    """Capture what `work` launches as a CUDA graph; `options` are those of `torch.cuda.graph`.
 
-    Meanwhile Python collects no garbage: freeing an unused graph would invalidate the capture.
+    Python's garbage collector is off during the capture: freeing an unused graph would invalidate it.
     """
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
     gc.disable()
     try:
-        # a stream of the current GPU: the default one is that of the first GPU on which anything was captured
+        # a stream of the current GPU: torch's default capture stream belongs to the GPU of the first capture
         with torch.cuda.graph(graph, stream=torch.cuda.Stream(), **options):
             work()
     finally:

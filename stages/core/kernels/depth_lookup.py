@@ -1,12 +1,13 @@
-"""Samples of bodies' surfaces looked up in the depths of others, as contacts of rigid bodies need them in each substep.
+"""Penetration depths and contact normals of surface samples of one body in another, for rigid-body contact.
 
-A body's depths below its surface are given at the nodes of a grid in its frame and interpolated linearly. Arrays are
-NumPy's, in double precision, as those of the rigid-body solver; bodies are at positions `at` (o, 3), turned by `turn`
-(o, 3, 3). `CompiledDepthLookup` does in Warp kernels on the CPU what `DepthLookup` does in NumPy, where these can be
-compiled.
+Each body has a grid in its own frame that stores depths below its surface (negative outside) at the nodes; depths are
+interpolated trilinearly. Arrays are NumPy's in double precision, as in the rigid-body solver. Bodies have positions
+`at` (o, 3) and rotations `turn` (o, 3, 3). `DepthLookup` is written in NumPy; `CompiledDepthLookup` does the same in
+Warp kernels on the CPU, where Warp can compile them.
 
-Where a body has an edge its depths increase in an oblique direction. The normal of a contact is that of a face: of
-faces that are parallel the one of the flatter surface, else that of the sample if it is on one (`surface_faces.py`).
+Near an edge of a body the gradient of the depth is oblique, so the contact normal is taken from a face: if two faces
+of the bodies are parallel, the face of the flatter surface; otherwise the face of the sample, if the sample is on one
+(`surface_faces.py`).
 """
 
 from __future__ import annotations
@@ -23,51 +24,51 @@ from stages.core.kernels.interop import compiles_for_cpu
 
 FACES = wp.constant(surface_faces.FACES)
 OPPOSED, CURVED = wp.constant(wp.float64(surface_faces.OPPOSED)), wp.constant(wp.float64(surface_faces.CURVED))
-CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
+CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # corners of a grid cell
 
 
 class Samples(NamedTuple):
-    """Samples of the surfaces of all bodies, in the frames of these."""
+    """Surface samples of all bodies, each in the frame of its body."""
 
     points: np.ndarray  # (s, 3)
-    normals: np.ndarray  # (s, 3), outwards
-    flatness: np.ndarray  # (s,), 0 where a sample is not on a face
-    faces: np.ndarray  # (s, 3, 3), normals of up to three faces that meet there, the others 0
-    nearest: np.ndarray  # (n,), the sample nearest to each node of the grids, one after the other; -1 for none
+    normals: np.ndarray  # (s, 3), outward
+    flatness: np.ndarray  # (s,), 1 in a plane, 0 where a sample is not on a face
+    faces: np.ndarray  # (s, 3, 3), normals of up to three faces that meet at the sample; unused rows are 0
+    nearest: np.ndarray  # (n,), sample nearest to each grid node, for the grids of all bodies in turn; -1: none
 
 
 class Inside(NamedTuple):
     """Samples of bodies a that are inside bodies b."""
 
-    row: np.ndarray  # (k,), of those looked up
-    x: np.ndarray  # (k, 3), positions
-    normal: np.ndarray  # (k, 3), out of b
-    depth: np.ndarray  # (k,)
-    facing: np.ndarray  # (k,), cosine of the angle at which the surfaces face each other
+    row: np.ndarray  # (k,), index among the samples looked up
+    x: np.ndarray  # (k, 3), world position
+    normal: np.ndarray  # (k, 3), contact normal in world axes, out of b
+    depth: np.ndarray  # (k,), penetration depth
+    facing: np.ndarray  # (k,), cosine of the angle at which the surfaces face each other: 1 if their normals oppose
 
 
 @wp.struct
 class DepthGrid:
-    """Where the grid of a body is, in its frame, and its nodes among those of all grids."""
+    """Depth grid of one body: its geometry in the body frame, and where its nodes are stored."""
 
-    first: wp.int64  # row of the first node
+    first: wp.int64  # index of its first node in the arrays of all grids
     shape: wp.vec3l  # nodes along x, y, z
-    low: wp.vec3d  # the first node
-    h: wp.float64  # between nodes
+    low: wp.vec3d  # position of the first node
+    h: wp.float64  # distance between nodes
 
 
 @wp.struct
 class DepthNodes:
-    """Values at the nodes of the grids, one after the other."""
+    """Values at the nodes of all grids, concatenated."""
 
     depth: wp.array[wp.float64]
-    smooth: wp.array[wp.float64]  # depth for directions
-    nearest: wp.array[wp.int64]  # sample; -1 for none
+    smooth: wp.array[wp.float64]  # blurred depth, whose gradient gives directions
+    nearest: wp.array[wp.int64]  # nearest sample; -1: none
 
 
 @wp.struct
 class SurfaceSample:
-    """One of Samples; its fields are described there."""
+    """One row of Samples, which describes the fields."""
 
     point: wp.vec3d
     normal: wp.vec3d
@@ -77,15 +78,15 @@ class SurfaceSample:
 
 @wp.struct
 class RigidPose:
-    """Where a body is."""
+    """Pose of a body."""
 
-    turn: wp.mat33d  # from its frame
+    turn: wp.mat33d  # rotation from the body frame to the world
     at: wp.vec3d
 
 
 @wp.struct
 class DepthQuery:
-    """Bodies a and b, and the sample of a that is looked up in b."""
+    """One query: a sample of body a looked up in the depth grid of body b."""
 
     a: wp.int64
     b: wp.int64
@@ -94,7 +95,7 @@ class DepthQuery:
 
 @wp.struct
 class InsideSample:
-    """What was found for a query, as in Inside; where the depth is 0 the rest is undefined."""
+    """Result of a query, with the fields of Inside; where the depth is 0 the other fields are undefined."""
 
     depth: wp.float64
     x: wp.vec3d
@@ -103,17 +104,20 @@ class InsideSample:
 
 
 def depth_lookup(depth: Sequence[np.ndarray], low: np.ndarray, h: np.ndarray, samples: Samples) -> DepthLookup:
-    """The lookup in grids of depths (x, y, z), of which `low` (o, 3) are the first nodes and h (o,) the distances."""
+    """Return the lookup for bodies with depth grids (x, y, z); compiled where Warp can compile for the CPU.
+
+    `low` (o, 3) are the positions of the first nodes and `h` (o,) the distances between nodes.
+    """
     return (CompiledDepthLookup if compiles_for_cpu() else DepthLookup)(depth, low, h, samples)
 
 
 class DepthLookup:
-    """Grids and samples of all bodies, and points looked up in them by NumPy."""
+    """Depth grids and surface samples of all bodies, with lookups in NumPy."""
 
     def __init__(self, depth: Sequence[np.ndarray], low: np.ndarray, h: np.ndarray, samples: Samples):
         self.samples = Samples(*map(np.ascontiguousarray, samples))
         self.depth = np.concatenate([d.ravel() for d in depth])
-        self.smooth = np.concatenate([ndimage.gaussian_filter(d, 1.0).ravel() for d in depth])  # for directions
+        self.smooth = np.concatenate([ndimage.gaussian_filter(d, 1.0).ravel() for d in depth])  # for gradients
         self.first = np.cumsum([0, *(d.size for d in depth)])[:-1]
         self.shape, self.low, self.h = np.array([d.shape for d in depth]), low, h
         self.high = low + h[:, None] * (self.shape - 1)
@@ -123,26 +127,27 @@ class DepthLookup:
     def distances(
         self, points: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
     ) -> np.ndarray:
-        """Lower bounds of the distances (k,) of points (k, 3), in the frames of bodies a (k,), from bodies b (k,).
+        """Return lower bounds (k,) of the signed distances of points from bodies b (k,), negative inside.
 
-        Negative inside.
+        `points` (k, 3) are in the frames of bodies a (k,).
         """
         x = self._relative(points, a, b, turn, at)
         inside = np.minimum(np.maximum(x, self.low[b]), self.high[b])
         node, f = self._cells(b, inside)
         distance = -interpolated(self.depth[node], f)
         beyond = ((x - inside) ** 2).sum(1)
-        # the body is in the box of its grid, so the angle at the nearest point of the box is at least a right one
+        # Outside the grid: `inside` is the nearest point of the grid's box. The body lies within the box, so the angle
+        # at that point is at least a right angle, and Pythagoras gives a lower bound.
         return np.where(beyond > 0, np.sqrt(beyond + np.maximum(distance, 0) ** 2), distance)
 
     def inside(self, sample: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray) -> Inside:
-        """Those of samples (k,) of bodies a (k,) that are inside bodies b (k,)."""
+        """Return those samples (k,) of bodies a (k,) that are inside bodies b (k,)."""
         return self.near(sample, a, b, turn, at, 0.0)
 
     def near(
         self, sample: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray, gap: float
     ) -> Inside:
-        """As `inside`, with those that are less than `gap` outside."""
+        """As `inside`, but including samples that are outside by less than `gap`."""
         points = self.samples.points[sample]
         node, f = self._cells(b, self._relative(points, a, b, turn, at))
         within = (np.abs(f - 0.5) <= 0.5).all(1)
@@ -156,9 +161,10 @@ class DepthLookup:
         return Inside(k, turned(turn[a], points[k]) + at[a], turned(turn[b], normal), depth[k], facing)
 
     def _facing(self, sample: np.ndarray, other: np.ndarray, outwards: np.ndarray, turn: np.ndarray):
-        """Normals (k, 3) out of bodies b, in their frames, of contacts of samples (k,) of bodies a near samples (k,) of
-        b, and the cosines (k,) of the angles at which they face each other. Depths in b increase against `outwards`
-        (k, 3); `turn` (k, 3, 3) is from a to b.
+        """Return contact normals (k, 3) out of bodies b, in their frames, and the cosines (k,) of facing angles.
+
+        `sample` (k,) are the samples of bodies a, `other` (k,) the nearest samples of bodies b (-1: none). `outwards`
+        (k, 3) is the direction in which the depth in b decreases; `turn` (k, 3, 3) rotates from a to b.
         """
         own, faces = turned(turn, self.samples.normals[sample]), self.samples.faces[sample]
         others = np.where(other[:, None, None] < 0, 0.0, self.samples.faces[other])
@@ -175,12 +181,14 @@ class DepthLookup:
         return normal, np.where(np.isfinite(most), most, -(own * outwards).sum(1))
 
     def _relative(self, points, a, b, turn, at) -> np.ndarray:
-        """Points in the frames of bodies b."""
+        """Transform points from the frames of bodies a to those of bodies b."""
         return turned(turn[b].transpose(0, 2, 1), turned(turn[a], points) + at[a] - at[b])
 
     def _cells(self, b: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (k, 8) of the nodes around points (k, 3) in the frames of bodies b (k,), and the places (k, 3) between
-        them, beyond 0..1 for points outside of the grid.
+        """Return the rows (k, 8) of the corner nodes of the cells that contain points x (k, 3), and the local
+        coordinates (k, 3) in the cells: 0..1, or beyond for points outside the grid.
+
+        The points are in the frames of bodies b (k,).
         """
         u = (x - self.low[b]) / self.h[b, None]
         cell = np.minimum(np.maximum(u.astype(np.int64), 0), self.shape[b] - 2)
@@ -188,9 +196,10 @@ class DepthLookup:
 
 
 class CompiledDepthLookup(DepthLookup):
-    """The same by kernels, whose launches are recorded once for arrays that are reused: preparing one takes longer.
+    """DepthLookup by Warp kernels.
 
-    What belongs together is one array of structs: on the CPU, Warp indexes arrays within a struct more slowly.
+    Launches are recorded once, for arrays that are reused, since preparing a launch takes longer than running it. Data
+    is stored as arrays of structs: on the CPU, Warp indexes arrays within a struct more slowly.
     """
 
     def __init__(self, depth: Sequence[np.ndarray], low: np.ndarray, h: np.ndarray, samples: Samples):
@@ -206,7 +215,7 @@ class CompiledDepthLookup(DepthLookup):
         self._reserve(1024)
 
     def _reserve(self, count: int) -> None:
-        """Make room for `count` points."""
+        """Allocate arrays and record launches for up to `count` points."""
         self._room = count
         self._points, self._out = np.empty((count, 3)), np.empty(count)
         self._queries, self._found = _records(DepthQuery, count), _records(InsideSample, count)
@@ -228,14 +237,14 @@ class CompiledDepthLookup(DepthLookup):
     def distances(
         self, points: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray
     ) -> np.ndarray:
-        """As those of DepthLookup."""
+        """See DepthLookup.distances."""
         count = self._put(a, b, turn, at)
         self._points[:count] = points
         _run(self._distance, count)
         return self._out[:count].copy()
 
     def inside(self, sample: np.ndarray, a: np.ndarray, b: np.ndarray, turn: np.ndarray, at: np.ndarray) -> Inside:
-        """As that of DepthLookup."""
+        """See DepthLookup.inside."""
         count = self._put(a, b, turn, at)
         self._queries["sample"][:count] = sample
         _run(self._inside, count)
@@ -245,12 +254,12 @@ class CompiledDepthLookup(DepthLookup):
 
 
 def _array(values: np.ndarray, dtype) -> wp.array:
-    """A view of contiguous values, as one of `dtype` for each row."""
+    """View contiguous values as a Warp array with one `dtype` per row, without a copy."""
     return wp.array(ptr=values.ctypes.data, dtype=dtype, shape=(len(values),), device="cpu")
 
 
 def _records(struct, count: int, **fields: np.ndarray) -> np.ndarray:
-    """`count` instances of a Warp struct with these fields, the others undefined."""
+    """Return `count` instances of a Warp struct with these field values; the other fields are uninitialised."""
     out = np.empty(count, struct.numpy_dtype())
     for name, values in fields.items():
         out[name] = values
@@ -265,7 +274,7 @@ def _run(recorded: wp.Launch, count: int) -> None:
 
 @wp.func
 def _place(g: DepthGrid, x: wp.vec3d):
-    """Row of the first node of the cell around a point, and the place of the point in it."""
+    """Return the row of the first node of the cell that contains a point, and the point's local coordinates in it."""
     u = (x - g.low) / g.h
     zero, two = wp.int64(0), wp.int64(2)
     i = wp.clamp(wp.int64(u[0]), zero, g.shape[0] - two)
@@ -277,7 +286,7 @@ def _place(g: DepthGrid, x: wp.vec3d):
 
 @wp.func
 def _interpolated(value: wp.array[wp.float64], node: int, shape: wp.vec3l, f: wp.vec3d):
-    """Value at a place in a cell."""
+    """Interpolate node values trilinearly at local coordinates f of a cell."""
     y = node + wp.int32(shape[2])
     x = wp.int32(shape[1] * shape[2])
     v00, v01 = wp.lerp(value[node], value[node + x], f[0]), wp.lerp(value[node + 1], value[node + x + 1], f[0])
@@ -287,7 +296,7 @@ def _interpolated(value: wp.array[wp.float64], node: int, shape: wp.vec3l, f: wp
 
 @wp.func
 def _gradient(value: wp.array[wp.float64], node: int, shape: wp.vec3l, f: wp.vec3d):
-    """Gradient of `_interpolated` [per edge of a cell]."""
+    """Gradient of `_interpolated` [1 / grid spacing]."""
     y = node + wp.int32(shape[2])
     x = wp.int32(shape[1] * shape[2])
     a00, a01, a10, a11 = value[node], value[node + 1], value[y], value[y + 1]
@@ -371,12 +380,12 @@ def _inside(
 
 
 def turned(R: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Points (k, 3), each turned by its matrix (k, 3, 3)."""
+    """Rotate each point (k, 3) by its own matrix (k, 3, 3)."""
     return np.einsum("kij,kj->ki", R, x)
 
 
 def interpolated(value: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Values (k,) at places (k, 3) in cells, between those at their corners (k, 8)."""
+    """Interpolate corner values (k, 8) of cells trilinearly at local coordinates f (k, 3)."""
     x, y, z = f.T
     v = np.ascontiguousarray(value.T)
     v = v[:4] + (v[4:] - v[:4]) * x
@@ -385,7 +394,7 @@ def interpolated(value: np.ndarray, f: np.ndarray) -> np.ndarray:
 
 
 def slope(value: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Gradients (k, 3) of `interpolated` [per edge of a cell]."""
+    """Gradients (k, 3) of `interpolated` [1 / grid spacing]."""
     x, y, z = f.T
     v = np.ascontiguousarray(value.T)
     dx = v[4:] - v[:4]

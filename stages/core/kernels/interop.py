@@ -18,7 +18,7 @@ _folders: list[TemporaryDirectory] = []  # deleted when the process ends
 
 @cache
 def _ready() -> None:
-    """Initialise Warp once, with a temporary folder for kernels where that in the user's home cannot be created."""
+    """Initialise Warp once, with a temporary kernel cache if the one in the user's home cannot be created."""
     try:
         _initialise()
     except OSError as error:
@@ -30,8 +30,11 @@ def _ready() -> None:
 
 
 def _initialise() -> None:
-    """Initialise Warp. Its native code reports a missing CUDA driver on file descriptor 2, where Python cannot filter
-    it; without a GPU that descriptor is redirected during initialisation."""
+    """Initialise Warp without its message about a missing CUDA driver.
+
+    Native code writes that message to file descriptor 2, where Python cannot filter it, so without a GPU the descriptor
+    is redirected during initialisation.
+    """
     if torch.cuda.is_available():
         wp.init()
         return
@@ -47,19 +50,19 @@ def _initialise() -> None:
 
 @cache
 def compiles_for_cpu() -> bool:
-    """Whether Warp can compile kernels for the CPU: some builds of it lack the library that does."""
+    """Whether Warp can compile kernels for the CPU; some builds of Warp lack the library for it."""
     _ready()
     return bool(wp.is_cpu_available())
 
 
 def kernel_device(tensor: torch.Tensor) -> torch.device:
-    """Where kernels for a tensor run: on its device, or on a GPU where none can be compiled for the CPU."""
+    """Return the device on which kernels for a tensor run: its own, or a GPU if Warp cannot compile for the CPU."""
     possible = tensor.is_cuda or compiles_for_cpu() or not torch.cuda.is_available()
     return tensor.device if possible else torch.device("cuda")
 
 
 def _require_compiler(tensor: torch.Tensor) -> None:
-    """Raise MissingPackage for a tensor on the CPU where no kernel can be compiled for it."""
+    """Raise MissingPackage for a CPU tensor if Warp cannot compile for the CPU."""
     _ready()
     if not (tensor.is_cuda or compiles_for_cpu()):
         raise MissingPackage("Warp has no compiler for the CPU here (its library warp-clang is missing); install it "
@@ -70,7 +73,7 @@ def view(tensor: torch.Tensor, dtype=None) -> wp.array:
     """Wrap a tensor as a Warp array over the same memory (no copy, no gradient), for a kernel on its device.
 
     `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix. Raises MissingPackage
-    for a tensor on the CPU where no kernel can be compiled for it.
+    for a CPU tensor if Warp cannot compile for the CPU.
     """
     _require_compiler(tensor)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
@@ -103,12 +106,13 @@ def launch(
 
 
 def empty_arrays(struct, device: str, shape: tuple[int, ...], **other: tuple[int, ...] | None):
-    """An instance of a Warp struct with uninitialised arrays of this shape, or of that given for a field; None leaves
-    a field out.
+    """Return an instance of a Warp struct with uninitialised arrays of `shape`.
+
+    `other` gives the shapes of individual fields; None leaves a field unset.
     """
     out = struct()
     for name, field in struct.vars.items():
-        if not hasattr(field.type, "dtype"):  # a number
+        if not hasattr(field.type, "dtype"):  # a scalar
             continue
         if (size := other.get(name, shape)) is not None:
             setattr(out, name, wp.empty(size, dtype=field.type.dtype, device=device))
@@ -116,10 +120,10 @@ def empty_arrays(struct, device: str, shape: tuple[int, ...], **other: tuple[int
 
 
 def with_arrays(struct, tensors: Mapping[str, torch.Tensor]):
-    """The instance of a Warp struct with these tensors as arrays, contiguous and 64-bit integers as 32-bit ones.
+    """Set array fields of a Warp struct to tensors, made contiguous and with int64 converted to int32; return it.
 
-    The struct gets Warp's array descriptors, not `wp.array` objects, which take four times as long to make; its
-    attributes are the tensors, which keeps their memory. A struct within another one is filled in place, as
+    The struct gets Warp's array descriptors instead of `wp.array` objects, which take four times as long to create; its
+    attributes hold the tensors, which keeps their memory alive. A nested struct is filled in place by
     `with_arrays(outer.inner, ...)`. Raises TypeError for a tensor of another type or number of dimensions.
     """
     fields, native = struct._cls.vars, struct.__ctype__()

@@ -1,7 +1,8 @@
-"""The rotations nearest to many matrices, one thread per matrix, without a singular value decomposition.
+"""Rotations nearest to many matrices, one thread per matrix, without a singular value decomposition.
 
-The rotation R(q) that maximises tr(R^T M) is that of the unit quaternion q with the largest q^T N q, where N is
-symmetric and linear in M, so q is an eigenvector. It is found by Jacobi's method, in double precision.
+The rotation R(q) that maximises tr(R^T M) belongs to the unit quaternion q that maximises q^T N q, where the symmetric
+4 x 4 matrix N is linear in M. So q is the eigenvector of N with the largest eigenvalue, which Jacobi's method finds in
+double precision.
 Source: Horn 1987, "Closed-form solution of absolute orientation using unit quaternions".
 """
 
@@ -17,12 +18,12 @@ from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 
-SWEEPS = 10  # at most; each of them squares the error, once it is small
+SWEEPS = 10  # maximum number of Jacobi sweeps; convergence is quadratic
 
 
 @wp.func
 def _rotate(A: wp.mat44d, c: wp.float64, s: wp.float64, p: int, q: int, columns: bool) -> wp.mat44d:
-    """Rows or columns p and q of A rotated in their plane."""
+    """Rotate rows or columns p and q of A in their plane, by the angle with cosine c and sine s."""
     for k in range(4):
         if columns:
             x, y = A[k, p], A[k, q]
@@ -72,9 +73,10 @@ def _nearest(start: int, piece: int, matrices: wp.array[wp.mat33d], out: wp.arra
 
 
 def nearest_rotations(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """The rotation nearest to each matrix in the Frobenius norm, without gradients.
+    """Return the rotation nearest to each matrix in the Frobenius norm, without gradients.
 
-    As `geometry.rotations.nearest_rotation`; where several are equally near, as for 0, one of them.
+    Equivalent to `geometry.rotations.nearest_rotation`. Where several rotations are equally near, as for the zero
+    matrix, one of them.
     """
     where = kernel_device(matrices)
     if where != matrices.device:

@@ -9,11 +9,11 @@ import torch
 
 
 def operator(name: str, shapes: Callable) -> Callable[[Callable], Callable]:
-    """Decorator: while torch.compile traces, the function is the custom operator ngff::`name`; else it runs directly.
+    """Decorate a function as the custom operator ngff::`name` while torch.compile traces; otherwise it runs directly.
 
     `shapes` takes the same arguments and returns uninitialised results, from which the compiler reads shapes and types.
-    The function has no gradient. Calling a custom operator costs more than these kernels do, and its first call imports
-    torch._dynamo, which takes over a second.
+    The function has no gradient. Direct calls avoid the overhead of a custom operator, which exceeds the time of these
+    kernels, and the import of torch._dynamo on its first call, which takes over a second.
     """
 
     def decorate(function: Callable) -> Callable:

@@ -1,7 +1,7 @@
 """Path costs of semi-global matching along one dimension, forward plus backward.
 
-On CUDA a block of threads follows each line, a thread for each label. On the CPU each thread takes some of the lines;
-the steps along them are PyTorch operations, which also specify the kernel.
+On CUDA one thread block aggregates each line, with one thread per label. On the CPU each thread processes some of the
+lines with the PyTorch operations of the reference.
 
 Source: Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", eq. 13.
 """
@@ -21,7 +21,7 @@ from stages.core.kernels.threads import parallel_map
 wp.set_module_options({"enable_backward": False})
 
 THREADS = 256
-GRAIN_SIZE = 32768  # elements per thread below which PyTorch does not use another one (at::internal::GRAIN_SIZE)
+GRAIN_SIZE = 32768  # elements per thread below which PyTorch adds no further thread (at::internal::GRAIN_SIZE)
 
 _FOLLOW = r"""
 __shared__ float before[258], lowest_of_warp[8];
@@ -67,9 +67,9 @@ def _paths(costs: wp.array3d[float], step_penalty: float, jump_penalty: float, t
 
 
 def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float) -> Float[Tensor, "l m d"]:
-    """Path costs of the d labels along the first dimension, forward plus backward.
+    """Aggregate the costs of d labels along the first dimension, forward plus backward, for each of the m lines.
 
-    A change of the label by one costs `step_penalty`, any other `jump_penalty`.
+    A label change of one costs `step_penalty`, a larger change `jump_penalty`.
     """
     _, lines, labels = costs.shape
     if not costs.is_cuda:

@@ -1,7 +1,7 @@
-"""Spherical harmonics of many Gaussians, each rotated by its own matrix: 16 at a time on a CPU, one per thread on CUDA.
+"""Rotation of the spherical harmonics of many Gaussians, each by its own matrix.
 
-As `geometry.harmonics.rotate_sh`, whose directions and inverses it uses. Coefficients with the identity rotation stay
-the same, bit for bit.
+Processes 16 Gaussians at a time on a CPU and one per thread on CUDA. Same method as `geometry.harmonics.rotate_sh`,
+with its probe directions and pseudo-inverses. Coefficients with an identity rotation are unchanged, bit for bit.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ auto scatter = [&](float* p, int stride, int column, F value) {
 """,
 )
 
-# The old functions at each probe turned back, and from these values the coefficients of each band.
+# Evaluates the old colour functions at the probe directions rotated back, and solves for the coefficients of each band.
 _ROTATE = r"""
 const int k = sh.shape[1], directions = probes.shape[0];
 F R[9], given[48], turned[48];
@@ -85,14 +85,14 @@ def _rotate(
 
 @cache
 def _tables(device: str) -> tuple[wp.array, wp.array]:
-    """The directions (d, 3), and for each coefficient (16, d) what the values there are multiplied by."""
+    """Return the probe directions (d, 3), and the weights (16, d) of the values there for each coefficient."""
     directions, inverses = probes()
     rows = torch.cat([torch.zeros(1, len(directions)), *inverses.values()])
     return tuple(view(x.float().contiguous().to(device)) for x in (directions, rows))
 
 
 def rotate_each_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients of the colour functions, each rotated by its own R."""
+    """Rotate the colour function of each Gaussian by its own R; return the new coefficients."""
     if degree_of(sh.shape[1]) == 0:
         return sh
     where = kernel_device(sh)

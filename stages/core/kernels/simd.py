@@ -1,9 +1,8 @@
-"""Vector types and functions for C++ snippets in Warp kernels, and their parallel launch on a CPU.
+"""SIMD vector types and functions for C++ snippets in Warp kernels, and parallel launches on a CPU.
 
-Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets use the
-compiler's vector types, which are lowered to what the processor has (one AVX-512 register, two AVX registers,
-four SSE or NEON registers). Warp releases the GIL while a kernel runs, so Python threads, each launching a part of the
-range, use the other cores.
+Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets use the compiler's
+vector types, which it lowers to the registers of the processor (one AVX-512, two AVX, four SSE or NEON registers). Warp
+releases the GIL while a kernel runs, so Python threads that each launch a part of the range use the other cores.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from stages.core.kernels.interop import launch
 from stages.core.kernels.threads import run_parallel
 
 LANES = 16
-MAX_THREADS = 8  # more have not been measured
+MAX_THREADS = 8  # the largest number of threads that was measured
 
 VECTORS = r"""
 typedef float F __attribute__((ext_vector_type(16)));
@@ -64,11 +63,11 @@ auto vmax = [](F a, F b) { return fmaxf(a, b); };
 auto vsqrt = [](F a) { return sqrtf(a); };
 auto log2v = [](F x) { return log2f(x); };
 """
-"""The types and functions of VECTORS that snippets for both devices use, with one lane per thread, for CUDA."""
+"""CUDA version, with one lane per thread, of the types and functions in VECTORS that snippets for both devices use."""
 
 
 def by_device(cuda: str, cpu: str) -> str:
-    """A snippet that is compiled as `cuda` for a GPU and as `cpu` otherwise."""
+    """Return a snippet that is compiled as `cuda` for a GPU and as `cpu` otherwise."""
     return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
 
 
@@ -93,24 +92,27 @@ auto sums = [](const F* v) {
 
 @cache
 def _load(kernel: wp.Kernel) -> None:
-    """Compile the kernel before the threads start, so that it is compiled once."""
+    """Compile the kernel before the threads start, so that only one of them compiles it."""
     wp.load_module(kernel.module, device="cpu")
 
 
 def num_threads() -> int:
-    """Number of parts that work is split into: torch's threads, at most MAX_THREADS. Results do not depend on it."""
+    """Return the number of parts to split work into: torch's threads, at most MAX_THREADS.
+
+    Results do not depend on it.
+    """
     return max(1, min(torch.get_num_threads(), MAX_THREADS))
 
 
 def even_bounds(n: int, pieces: int) -> list[int]:
-    """Bounds [0, ..., n] of `pieces` nearly equal parts of range(n)."""
+    """Return the bounds [0, ..., n] of `pieces` nearly equal parts of range(n)."""
     return [n * i // pieces for i in range(pieces + 1)]
 
 
 def launch_ranges(kernel: wp.Kernel, bounds: list[int], inputs: list) -> None:
-    """Launches `kernel(start, piece, *inputs)` once for each piece bounds[i]:bounds[i + 1], on all threads.
+    """Launch `kernel(start, piece, *inputs)` once for each piece bounds[i]:bounds[i + 1], on all threads.
 
-    A kernel adds `start` to its thread index.
+    The kernel adds `start` to its thread index.
     """
     pieces = [(i, a, b - a) for i, (a, b) in enumerate(zip(bounds, bounds[1:], strict=False)) if b > a]
     if not pieces:

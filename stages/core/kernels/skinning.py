@@ -2,7 +2,7 @@
 
 A Gaussian at X is bound to keypoints X_j with displacement u_j and displacement gradient G_j (F_j = I + G_j):
     x = X + sum w_j (u_j + G_j (X - X_j)),    F = I + sum w_j G_j,    covariance -> F covariance F^T.
-Gaussians whose G is exactly zero keep their quats and scales bit for bit.
+Gaussians whose weighted gradient sum w_j G_j is exactly zero keep their quats and scales bit for bit.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from stages.core.scene.trajectory import Binding
 
 
 class KeypointMotion(NamedTuple):
-    """Keypoints at rest, and how they and what is around them moved."""
+    """Rest positions of the keypoints, their displacements and displacement gradients."""
 
     rest: Float[Tensor, "p 3"]  # [m]
     displacement: Float[Tensor, "p 3"]  # [m]
-    gradient: Float[Tensor, "p 3 3"]  # of the displacement
+    gradient: Float[Tensor, "p 3 3"]  # displacement gradient G
 
 
 @wp.struct
@@ -48,7 +48,7 @@ class KeypointMotionArrays:
 
 @wp.struct
 class Ellipsoids:
-    """What skinning changes of Gaussians, for kernels."""
+    """The properties of Gaussians that skinning changes, for kernels."""
 
     means: wp.array[wp.vec3]
     quats: wp.array[wp.vec4]
@@ -57,10 +57,10 @@ class Ellipsoids:
 
 @wp.func
 def _rotation_of(F: wp.mat33) -> wp.mat33:
-    """Polar factor of F with determinant +1.
+    """Rotation of the polar decomposition of F (determinant +1).
 
-    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) converges quadratically; inverted and nearly singular F use
-    the singular value decomposition.
+    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) converges quadratically; for an inverted or nearly singular F
+    the singular value decomposition is used.
     """
     if wp.determinant(F) > 1.0e-3:
         R = F
@@ -99,10 +99,10 @@ def _orthogonalise(M: wp.mat33, p: int, q: int) -> wp.mat33:
 
 @wp.func
 def _axes(M: wp.mat33) -> wp.mat33:
-    """Semi-axes (columns) of the ellipsoid that M makes of the unit ball.
+    """Semi-axes (columns) of the ellipsoid that is the image of the unit ball under M.
 
-    One-sided Jacobi (Hestenes 1958): two or three sweeps when M is close to rotated semi-axes, and a short axis is as
-    accurate as the long ones. wp.svd3 has errors of up to 1e-3.
+    One-sided Jacobi (Hestenes 1958): takes two or three sweeps when the columns of M are nearly orthogonal, and
+    computes short axes as accurately as long ones. wp.svd3 has errors of up to 1e-3.
     """
     for _ in range(8):
         before = M
@@ -143,7 +143,7 @@ def _skin(
     y = wp.vec3(M[0, 1], M[1, 1], M[2, 1])
     z = wp.vec3(M[0, 2], M[1, 2], M[2, 2])
     moved.scales[i] = wp.vec3(wp.max(wp.length(x), thin), wp.max(wp.length(y), thin), wp.max(wp.length(z), thin))
-    # a right-handed frame, also where an axis vanished
+    # build a right-handed frame even where an axis has vanished
     if wp.length(x) <= thin:
         x = wp.cross(y, z)
     if wp.length(y) <= thin:
@@ -158,7 +158,7 @@ def _skin(
 def skin_gaussians(
     binding: Binding, keypoints: KeypointMotion, gaussians: Gaussians
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"], Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Deformed means [m], quats, scales [m] and rotations of Gaussians that are bound to keypoints."""
+    """Return the deformed means [m], quats, scales [m] and rotations of Gaussians that are bound to keypoints."""
     g, where = gaussians, kernel_device(gaussians.means)
     given = {name: getattr(g, name).to(where).contiguous() for name in ("means", "quats", "scales")}
     moved = {name: torch.empty_like(x) for name, x in given.items()}

@@ -1,7 +1,7 @@
-"""Fractions of an overhead sky and of a lamp that spheres block at points: one thread per point, over all objects.
+"""Fractions of an overhead sky and of a lamp that spheres block at points, one thread per point.
 
-See `stages.core.raster.shadows` for the formula and its sources. The spheres of an object have one weight, so that an
-object takes two logarithms, of products over its spheres.
+See `stages.core.raster.shadows` for the formula and its sources. All spheres of an object have the same weight, so
+each object takes only two logarithms, of the products over its spheres.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from stages.core.kernels.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_BLOCKED = 0.999  # by one sphere: its logarithm is finite
-MIN_EFFECT = 0.01  # objects that block less of the sky are left out
-PIECES = 4  # of the points for each thread on a CPU: objects are near some of them only
+MAX_BLOCKED = 0.999  # largest fraction that one sphere blocks, so that the logarithm of the rest is finite
+MIN_EFFECT = 0.01  # objects that block less than this fraction of the sky, and none of the lamp, are skipped
+PIECES = 4  # parts of the points per CPU thread, to balance the load: objects are near only some of the points
 
 
 class Lamp(NamedTuple):
@@ -33,21 +33,21 @@ class Lamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Spheres:
-    """Spheres of the objects, those of an object next to each other."""
+    """Spheres of all objects; the spheres of each object are contiguous."""
 
     centres: Float[Tensor, "m 3"]
     radii: Float[Tensor, "m"]
-    weights: Float[Tensor, "m"]  # exponents of what a sphere lets pass, the same for all of an object
+    weights: Float[Tensor, "m"]  # exponent w of a sphere's visibility, equal for all spheres of an object
     object_id: Int[Tensor, "m"]
 
     def to(self, device: torch.device | str) -> Spheres:
-        """The spheres on a device."""
+        """Return a copy on a device."""
         return Spheres(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @wp.struct
 class ShadedPoints:
-    """Points, and the objects that do not shade them: their own."""
+    """Shaded points, and the object that each belongs to and is not shaded by."""
 
     at: wp.array[wp.vec3]
     own: wp.array[wp.int64]
@@ -55,15 +55,15 @@ class ShadedPoints:
 
 @wp.struct
 class SphereArrays:
-    """Spheres for kernels; at the first sphere of each object, what bounds those of the object."""
+    """Spheres for kernels. The bounds of an object are stored at the index of its first sphere."""
 
     centres: wp.array[wp.vec3]
     radii: wp.array[float]
     weights: wp.array[float]
     object_id: wp.array[wp.int64]
-    middles: wp.array[wp.vec3]  # mean of the object's centres
-    reaches: wp.array[float]  # how far its spheres extend from there
-    ends: wp.array[int]  # one past the last of them
+    middles: wp.array[wp.vec3]  # centre of the object's bounding sphere: the mean of its sphere centres
+    reaches: wp.array[float]  # radius of the object's bounding sphere
+    ends: wp.array[int]  # index one past the object's last sphere
 
 
 @wp.struct
@@ -76,7 +76,7 @@ class LampDisc:
 
 @wp.kernel
 def _bound(spheres: SphereArrays):
-    """Find the bounds of each object, at its first sphere."""
+    """Compute the bounding sphere of each object, in the thread of its first sphere."""
     first = wp.tid()
     spheres.ends[first] = first
     if first > 0 and spheres.object_id[first - 1] == spheres.object_id[first]:
@@ -125,11 +125,11 @@ def _block(
                 along = wp.dot(lamp.direction, c)
                 if along > 0.0:
                     across = wp.sqrt(wp.max(square - along * along, 0.0))
-                    disc = wp.max(lamp.spread * along, 1.0e-6)  # radius of the lamp, seen at the distance of the sphere
+                    disc = wp.max(lamp.spread * along, 1.0e-6)  # radius of the lamp's cone at the sphere's distance
                     edge = wp.clamp((across - wp.abs(disc - r)) / (2.0 * wp.min(disc, r)), 0.0, 1.0)
                     hidden = wp.min(r * r / (disc * disc), 1.0) * (1.0 - edge * edge * (3.0 - 2.0 * edge))
                     past_lamp *= 1.0 - wp.min(hidden, wp.static(MAX_BLOCKED))
-                if j + 1 == end or wp.min(past_sky, past_lamp) < 1.0e-30:  # before the products vanish
+                if j + 1 == end or wp.min(past_sky, past_lamp) < 1.0e-30:  # before the products underflow
                     sky_log += spheres.weights[first] * wp.log(past_sky)
                     lamp_log += spheres.weights[first] * wp.log(past_lamp)
                     past_sky = 1.0
@@ -142,9 +142,9 @@ def _block(
 def blocked_light(
     points: Float[Tensor, "n 3"], own: Int[Tensor, "n"], spheres: Spheres, lamp: Lamp
 ) -> Float[Tensor, "n 2"]:  # fmt: skip
-    """Fractions of the sky and of the lamp that the spheres block at points of their `own` objects.
+    """Return the fractions of the sky and of the lamp that the spheres block at each point.
 
-    The spheres of an object do not shade its own points.
+    `own` is the object that each point belongs to; the spheres of an object do not shade its own points.
     """
     where = kernel_device(points)
     if where != points.device:

@@ -1,13 +1,13 @@
 """Threads on the CPU: a pool for kernels, and the number of threads of PyTorch's operations.
 
-A Warp launch on the CPU runs on the calling thread and releases Python's lock, so several threads launch the parts of
-a computation in parallel. The calling thread takes part: it runs the tasks that no pool thread has claimed yet. When
-other processes occupy the cores, it does all of the work instead of waiting for the pool. CUDA has a current GPU for
-each thread, at first GPU 0: pool threads take that of the caller, which is what "cuda" means in a task.
+A Warp launch on the CPU runs on the calling thread and releases the GIL, so several threads can launch the parts of a
+computation in parallel. The calling thread takes part: it runs the tasks that no pool thread has claimed yet, so when
+other processes occupy the cores it does all the work instead of waiting for the pool. The current GPU of CUDA is
+per thread and initially GPU 0, so pool threads set that of the caller; "cuda" then means the same device in a task.
 
 PyTorch's operations use OpenMP, whose threads wait passively (see `stages`). Waking them takes longer than most
 operations of a small model: 40,000 products take 6 us on one thread and 72 us on two (AMD EPYC). Within
-`small_operations` they run on the calling thread, except within `large_operation`.
+`small_operations` PyTorch's operations run on the calling thread, except within `large_operation`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Task = Callable[[], None]
 
 
 class TaskBatch(NamedTuple):
-    """Tasks that threads run together."""
+    """Tasks that several threads run together."""
 
-    tasks: deque[Task]  # to claim
-    ended: SimpleQueue[BaseException | None]  # one entry for each task that ended
-    gpu: int | None  # the current one of the caller; None before CUDA is used
+    tasks: deque[Task]  # not yet claimed
+    ended: SimpleQueue[BaseException | None]  # one entry for each finished task: its exception, or None
+    gpu: int | None  # current GPU of the caller; None before CUDA is used
 
 
 def run_parallel(tasks: Sequence[Task]) -> None:
-    """Run tasks that do not depend on each other; return when all have ended.
+    """Run independent tasks in parallel; return when all have ended.
 
-    At most `torch.get_num_threads()` run at a time. The first exception of a task is raised after all have ended,
+    At most `torch.get_num_threads()` run at a time. The first exception of a task is raised after all tasks have ended,
     since they may share memory.
     """
     _run(tasks, _helpers(max(0, torch.get_num_threads() - 1))[: len(tasks) - 1])
@@ -55,11 +55,11 @@ def _run(tasks: Sequence[Task], helpers: list[SimpleQueue[TaskBatch]]) -> None:
 
 
 def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Results of a function for independent items, in order, by `run_parallel`.
+    """Apply a function to independent items in parallel; return the results in order.
 
-    For functions that spend their time in NumPy, SciPy or PyTorch, which release Python's lock. PyTorch's operations
-    within run on one thread each, whichever thread takes the item, so that their sums do not depend on it, and with
-    gradients only if the caller has them.
+    For functions that spend their time in NumPy, SciPy or PyTorch, which release the GIL. PyTorch's operations within
+    run on one thread, so that results do not depend on which thread takes an item. Gradient and inference modes are
+    those of the caller.
     """
     results: list[Any] = [None] * len(items)
     gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -91,18 +91,18 @@ def _work(batch: TaskBatch) -> None:
 
 @cache
 def _helpers(count: int) -> list[SimpleQueue[TaskBatch]]:
-    """Inboxes of that many threads, which live as long as the process."""
+    """Start `count` pool threads, which live as long as the process; return their inboxes."""
     threads, started = torch.get_num_threads(), Barrier(count + 1)
     inboxes: list[SimpleQueue[TaskBatch]] = [SimpleQueue() for _ in range(count)]
     for inbox in inboxes:
         Thread(target=_serve, args=(inbox, started), name="kernels", daemon=True).start()
     started.wait()
-    torch.set_num_threads(threads)  # of this thread as before, and of those to come
+    torch.set_num_threads(threads)  # restore the number for this thread and for threads started later
     return inboxes
 
 
 def _serve(inbox: SimpleQueue[TaskBatch], started: Barrier) -> None:
-    torch.set_num_threads(1)  # of this thread
+    torch.set_num_threads(1)  # applies to this thread
     started.wait()
     while True:
         batch = inbox.get()
@@ -111,12 +111,12 @@ def _serve(inbox: SimpleQueue[TaskBatch], started: Barrier) -> None:
         _work(batch)
 
 
-_thread_count: list[int] = []  # outside of the current `small_operations`, if there is one
+_thread_count: list[int] = []  # stack of the numbers of threads outside of each active `small_operations`
 
 
 @contextmanager
 def small_operations() -> Iterator[None]:
-    """PyTorch's operations within run on the calling thread alone, except within `large_operation`."""
+    """Run PyTorch's operations on the calling thread alone, except within `large_operation`."""
     _thread_count.append(torch.get_num_threads())
     torch.set_num_threads(1)
     try:
@@ -127,7 +127,7 @@ def small_operations() -> Iterator[None]:
 
 @contextmanager
 def large_operation() -> Iterator[None]:
-    """PyTorch's operations within run on all threads again; without effect outside of `small_operations`."""
+    """Run PyTorch's operations within `small_operations` on all threads again; elsewhere this has no effect."""
     before = torch.get_num_threads()
     if _thread_count:
         torch.set_num_threads(_thread_count[0])
@@ -138,5 +138,5 @@ def large_operation() -> Iterator[None]:
             torch.set_num_threads(before)
 
 
-if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+if hasattr(os, "register_at_fork"):  # a forked child does not inherit the pool threads of its parent
     os.register_at_fork(after_in_child=_helpers.cache_clear)

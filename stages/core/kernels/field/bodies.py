@@ -1,10 +1,10 @@
-"""Body state of the force-field step: half a drift step and world positions of the points.
+"""Body state of the force-field step: half a drift step, and world positions of the points.
 
 One Triton program per object holds all of its points in registers. Reference:
 `stages.core.models.field.force_field`.
 
-Shapes: i counts the b o objects, n points each. Body rows are (b o, BODY_SIZE); point arrays (b o, POINT_SIZE, n) and
-(b o, FIELD_SIZE, n), each component contiguous over the points.
+Shapes: i is the index over b x o objects with n points each. Body rows are (b o, BODY_SIZE); point arrays are
+(b o, POINT_SIZE, n) and (b o, FIELD_SIZE, n), with each component contiguous over the points.
 """
 
 from typing import NamedTuple
@@ -36,12 +36,12 @@ from stages.core.kernels.field.vec3 import (
 )
 
 # columns of a body row: centre of mass, velocity, angular momentum, rotation matrix, inverse inertia in world axes,
-# quaternion, bounding box, and contact radius (two bodies farther apart than the sum of theirs cannot touch)
+# quaternion, bounding box, and contact radius (bodies farther apart than the sum of their radii cannot touch)
 BODY_SIZE = tl.constexpr(40)
 COM, VELOCITY, MOMENTUM, ROTATION, INVERSE_INERTIA, QUAT, BOX_LOW, BOX_HIGH, CONTACT_RADIUS = (
     tl.constexpr(i) for i in (0, 3, 6, 9, 18, 27, 31, 34, 37)
 )
-# columns of a point in the world frame, and in the body frame (displacement, its rate, virial field)
+# columns of a point: in the world frame, and in the body frame (displacement, displacement rate, virial field)
 POINT_SIZE, FIELD_SIZE = tl.constexpr(12), tl.constexpr(9)
 POINT, SPEED, NORMAL, ARM = (tl.constexpr(i) for i in (0, 3, 6, 9))
 U, DU, VIRIAL = (tl.constexpr(i) for i in (0, 3, 6))
@@ -49,7 +49,7 @@ WRENCH_SIZE = tl.constexpr(6)  # columns: force and torque
 
 
 class FieldConstants(NamedTuple):
-    """The constants of the field, which are defined in the modules of `stages.core.models.field`."""
+    """Constants of the force field; they are defined in the modules of `stages.core.models.field`."""
 
     FRAME: float
     SEARCH_RADIUS: float
@@ -74,7 +74,7 @@ class FieldConstants(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """What a step reads: contiguous arrays of the objects, their number, and the length of the step."""
+    """Inputs of a step: contiguous arrays over the objects, their number, and the time step."""
 
     arm: Tensor  # (b o n 3) keypoints in the body frame [m]
     normal: Tensor  # (b o n 3)
@@ -84,29 +84,29 @@ class StepInputs(NamedTuple):
     size: Tensor  # (b o) [m]
     mass: Tensor  # (b o) [kg]
     inverse: Tensor  # (b o 3 3) inverse inertia per unit of mass, body frame [1/m^2]
-    keypoint_inverse: Tensor  # (b o 3 3) that of the keypoints
+    keypoint_inverse: Tensor  # (b o 3 3) the same for the keypoints as point masses
     pinned: Tensor  # (b o)
-    box: Tensor  # (b o 6) room of each object: low and high corner [m]
+    box: Tensor  # (b o 6) room that each object moves in: low and high corner [m]
     gravity: Tensor  # (b 3) [m/s^2]
     embedding: Tensor  # (b o h)
     stiffness: Tensor  # (b o) [1/s^2]
     damping: Tensor  # (b o) [1/s]
     compliance_scale: Tensor  # (b o)
-    o: int  # objects of a scene
-    n: int  # keypoints of an object
+    o: int  # objects per scene
+    n: int  # keypoints per object
     dt: float  # [s]
     BLOCK: tl.constexpr  # n, padded to a power of two
 
 
 class Kinematics(NamedTuple):
-    """Bodies and keypoints after half a drift."""
+    """Bodies and keypoints after half a drift step."""
 
     body: Tensor  # (b o, BODY_SIZE)
     points: Tensor  # (b o, POINT_SIZE, n)
     field: Tensor  # (b o, FIELD_SIZE, n)
-    planes: Tensor  # (b o, 2, n) distance to the floor and to the nearest wall [m], the least of now and a frame later
-    o: int  # objects of a scene
-    n: int  # keypoints of an object
+    planes: Tensor  # (b o, 2, n) distance to the floor and to the nearest wall [m], the smaller of now and one FRAME on
+    o: int  # objects per scene
+    n: int  # keypoints per object
     BLOCK: tl.constexpr  # n, padded to a power of two
 
 
@@ -127,14 +127,14 @@ def nearest_wall(x, room):
 
 @triton.jit
 def clamp_displacements(u, size, MAX_DISPLACEMENT: tl.constexpr):
-    """Displacements scaled so that the largest is at most MAX_DISPLACEMENT x the object's size [m]."""
+    """Scale all displacements so that the largest is at most MAX_DISPLACEMENT times the object's size [m]."""
     limit = MAX_DISPLACEMENT * size
     return scale3(limit / tl.maximum(tl.sqrt(tl.max(dot(u, u))), limit), u)
 
 
 @triton.jit
 def drift_half_step(state, inputs, drifted, C: tl.constexpr):
-    """Drift bodies by dt / 2 and evaluate their points at that time: writes `drifted`. C: the FieldConstants."""
+    """Drift bodies by dt / 2 and evaluate their points at that time; writes `drifted`. C is the FieldConstants."""
     i, n, dt = tl.program_id(0), inputs.n, inputs.dt
     free = 1 - tl.load(inputs.pinned + i).to(tl.float32)
     inertia = read9(inputs.inverse + 9 * i)
@@ -184,7 +184,7 @@ def drift_half_step(state, inputs, drifted, C: tl.constexpr):
 
 @triton.jit
 def world_points(state, arm, points, n, BLOCK: tl.constexpr):
-    """World positions (b o, n, 3) of the displaced points of bodies."""
+    """Compute the world positions (b o, n, 3) of the displaced points of bodies."""
     i, r = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     at, inside = (i * n + r) * 3, r < n
     x = add(load3(arm + at, 1, inside), load3(state.u + at, 1, inside))

@@ -1,8 +1,8 @@
 """Broad and narrow phase of the force field's contacts: compact lists of the contact points of each object.
 
-`gather_candidates` (broad phase) lists the points of each object near the bounding box of each other object,
-`nearest_candidates` (narrow phase) finds for each of them the other object's nearest point, and `select_contacts` keeps
-the closest of these, and of the points near floor and walls, as contact points.
+`gather_candidates` (broad phase) lists the points of each object near the bounding box of each other object.
+`nearest_candidates` (narrow phase) finds the other object's nearest point for each listed point. `select_contacts`
+keeps the closest of these pairs, and of the points near the floor and the walls, as contact points.
 Reference: `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
 """
 
@@ -15,34 +15,34 @@ from torch import Tensor
 from stages.core.kernels.field.bodies import BODY_SIZE, BOX_HIGH, BOX_LOW, CONTACT_RADIUS, POINT, POINT_SIZE, SPEED
 from stages.core.kernels.field.vec3 import add, dot, load3, scale3, store3, sub
 
-QUERY_BLOCK, CANDIDATE_CHUNK = tl.constexpr(16), tl.constexpr(128)  # points per program, candidates read at a time
+QUERY_BLOCK, CANDIDATE_CHUNK = tl.constexpr(16), tl.constexpr(128)  # points per program, candidates per iteration
 
 
 class NearPoints(NamedTuple):
-    """Points of each object near the bounding box of each other object, k = o - 1 of them."""
+    """Points of each object near the bounding box of each of the k = o - 1 other objects."""
 
     position: Tensor  # (b o k 3 n) [m]
     which: Tensor  # (b o k n) indices within the object
     count: Tensor  # (b o k)
-    key: Tensor  # (b o k n) distance to the nearest point of the other object [m], the smaller of now and a frame later
-    partner: Tensor  # (b o k n) index of that point
+    key: Tensor  # (b o k n) distance to the nearest point of the other object [m], the smaller of now and one FRAME on
+    partner: Tensor  # (b o k n) index of this nearest point
 
 
 class ContactLists(NamedTuple):
-    """Contact points of each object, stored one after the other: with each other object, the floor and the walls."""
+    """Contact points of each object in consecutive lists: one per other object, then the floor, then the walls."""
 
-    count: Tensor  # (b o, o + 1) of each list
+    count: Tensor  # (b o, o + 1) contact points in each list
     point: Tensor  # (b o, slots) keypoint of each contact point
     partner: Tensor  # (b o, slots) keypoint of the other object
     record: Tensor  # (b o, slots COLUMNS) features, see `contact_features`
-    acceleration: Tensor  # (b o, o + 1, 3, n) of the keypoints, by each list [m/s^2]
+    acceleration: Tensor  # (b o, o + 1, 3, n) acceleration of the keypoints due to each list [m/s^2]
     wide: int  # slots of each list of contacts with another object
     narrow: int  # slots of the list of contacts with walls
-    slots: int  # of all lists
-    o: int  # objects of a scene
-    n: int  # keypoints of an object
-    FLOOR_BLOCKS: tl.constexpr  # blocks of rows of the floor's list, padded to a power of two
-    PLANE_BLOCKS: tl.constexpr  # of the lists of floor and walls
+    slots: int  # slots of all lists
+    o: int  # objects per scene
+    n: int  # keypoints per object
+    FLOOR_BLOCKS: tl.constexpr  # blocks of rows in the floor's list, padded to a power of two
+    PLANE_BLOCKS: tl.constexpr  # blocks of rows in the lists of floor and walls, padded to a power of two
 
 
 @triton.jit
@@ -53,15 +53,17 @@ def other_object(i, k, o):
 
 @triton.jit
 def _contact_distance(body, i, j, SEARCH_RADIUS: tl.constexpr):
-    """Distance [m] beyond which two objects cannot touch within a frame."""
+    """Distance [m] beyond which two objects cannot touch within one FRAME."""
     radius = tl.load(body + BODY_SIZE * i + CONTACT_RADIUS) + tl.load(body + BODY_SIZE * j + CONTACT_RADIUS)
     return tl.minimum(radius, SEARCH_RADIUS)
 
 
 @triton.jit
 def gather_candidates(valid, drifted, candidates, C: tl.constexpr):
-    """List the points of object i within contact distance of another object's bounding box: `position`, `which` and
-    `count` of the candidates."""
+    """List the points of object i within contact distance of another object's bounding box.
+
+    Writes `position`, `which` and `count` of the candidates.
+    """
     i, k, o, n = tl.program_id(0), tl.program_id(1), drifted.o, drifted.n
     j = other_object(i, k, o)
     radius = _contact_distance(drifted.body, i, j, C.SEARCH_RADIUS)
@@ -80,7 +82,7 @@ def gather_candidates(valid, drifted, candidates, C: tl.constexpr):
 
 @triton.jit
 def nearest_candidates(drifted, candidates, C: tl.constexpr):
-    """For each listed point find the other object's nearest listed point: `partner` and `key` of the candidates."""
+    """Find the other object's nearest listed point for each listed point; writes `partner` and `key`."""
     o, n = drifted.o, drifted.n
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
     j = other_object(i, k, o)
@@ -119,7 +121,7 @@ def nearest_candidates(drifted, candidates, C: tl.constexpr):
 
 @triton.jit
 def _smallest(key, near, count):
-    """The keys as sortable integers, and the `count`-th smallest of those with `near`, found by bisection over bits."""
+    """Return the keys as sortable integers, and the `count`-th smallest one among `near`, found bit by bit."""
     bits = key.to(tl.int32, bitcast=True).to(tl.int64)
     bits = tl.where(bits < 0, -1 - (bits & 0x7FFFFFFF), bits) + 0x80000000
     bits = tl.where(near, bits, 0x1FFFFFFFF)
@@ -133,9 +135,11 @@ def _smallest(key, near, count):
 
 @triton.jit
 def select_contacts(valid, drifted, candidates, lists, C: tl.constexpr):
-    """Select the contact points of an object with one other object, the floor or the walls: the closest ones, at most
-    a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes `count`, `point` and `partner` of the
-    lists, and zeros as accelerations."""
+    """Select the closest contact points of an object with another object, the floor or the walls.
+
+    Keeps at most a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes `count`, `point` and
+    `partner` of the lists, and sets the accelerations to zero.
+    """
     i, k, o, n = tl.program_id(0), tl.program_id(1), drifted.o, drifted.n
     m = o - 1
     r = tl.arange(0, drifted.BLOCK)
@@ -162,7 +166,7 @@ def select_contacts(valid, drifted, candidates, lists, C: tl.constexpr):
         bits, limit = _smallest(key, near, limit_count)
         near &= bits <= limit
     slot = tl.cumsum(near.to(tl.int32), 0) - 1
-    near &= slot < limit_count  # ties
+    near &= slot < limit_count  # equal keys can exceed the limit
     tl.store(lists.point + to + slot, own, mask=near)
     tl.store(lists.partner + to + slot, other, mask=near)
     tl.store(lists.count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

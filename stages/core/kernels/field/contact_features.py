@@ -1,4 +1,4 @@
-"""Input features of contact points: vectors and scalars for each block of the lists made by `broad_phase`.
+"""Input features of contact points: vectors and scalars for each block of the contact lists from `broad_phase`.
 
 A block of ROWS contact points is one record (see `layers`). Reference: `stages.core.models.field.contact_points`.
 Written in Triton (see `compilers`).
@@ -22,14 +22,14 @@ from stages.core.kernels.field.broad_phase import other_object
 from stages.core.kernels.field.layers import FIRST_SCALAR, MAX_VECTORS, ROWS
 from stages.core.kernels.field.vec3 import add, dot, load3, read3, read9, scale3, solve_symmetric, store3, sub
 
-GATE = tl.constexpr(38)  # column of the contact gate, one of the scalars
-MASS_FRACTION = tl.constexpr(43)  # column of the point's mass fraction, not a network input
+GATE = tl.constexpr(38)  # column of the contact gate, which is one of the scalars
+MASS_FRACTION = tl.constexpr(43)  # column of the point's mass fraction, which is not a network input
 COLUMNS = tl.constexpr(44)
 
 
 @triton.jit
 def contact_list(lists, slot, m):
-    """The list of an object that a slot belongs to (other objects, floor, walls), and that list's first slot."""
+    """Return the index of the list that a slot belongs to (other objects, floor, walls), and the list's first slot."""
     k = tl.minimum(slot // lists.wide, m)
     start = k * lists.wide
     if slot >= lists.slots - lists.narrow:
@@ -39,9 +39,9 @@ def contact_list(lists, slot, m):
 
 @triton.jit
 def _response(J, r):
-    """Inverse effective mass 1 - [r] J [r] of a point at arm r, for unit mass: the velocity per unit impulse.
+    """Inverse effective mass 1 - [r] J [r] of a point at arm r of a body of unit mass: velocity per unit impulse.
 
-    Symmetric, as xx, xy, xz, yy, yz, zz; J is the inverse inertia.
+    J is the inverse inertia. The result is symmetric and returned as xx, xy, xz, yy, yz, zz.
     """
     a = sub(scale3(r[2], (J[1], J[4], J[7])), scale3(r[1], (J[2], J[5], J[8])))
     b = sub(scale3(r[0], (J[2], J[5], J[8])), scale3(r[2], (J[0], J[3], J[6])))
@@ -65,8 +65,10 @@ def _length(a):
 
 @triton.jit
 def contact_features(inputs, drifted, lists, C: tl.constexpr):
-    """Write the features of a block of contact points into the lists' `record`: with another object 10 vectors and
-    7 scalars, with floor or walls 8 and 5."""
+    """Write the features of a block of contact points into the lists' `record`.
+
+    Contacts with another object have 10 vectors and 7 scalars, contacts with floor or walls 8 vectors and 5 scalars.
+    """
     i, o, n, slots = tl.program_id(0), inputs.o, inputs.n, lists.slots
     m, slot = o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(lists, slot, m)

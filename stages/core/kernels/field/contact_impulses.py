@@ -1,6 +1,7 @@
-"""Contacts of rigid bodies: their impulses as functions of the bodies' velocities, and the arrays of their solution.
+"""Regularised contact impulses of rigid bodies as functions of the bodies' velocities, and the arrays of the solver.
 
-The impulse along a normal, (target - normal speed) / R_n, never pulls; that across it, -slip / R_t, is at most `bound`.
+The normal impulse is (target - normal speed) / R_n, and never attractive. The friction impulse is -slip / R_t, with a
+magnitude of at most `bound`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import warp as wp
 from stages.core.kernels.interop import empty_arrays
 
 f64 = wp.float64
-# Of the inverse effective mass; a box creeps on a slope by a thousandth of what it would gain in a step.
+# R_n and R_t as fractions of the inverse effective mass of a contact. With these values a box held by friction on a
+# slope creeps at a thousandth of the speed that gravity along the slope would add in one step.
 NORMAL_REGULARISATION = wp.constant(f64(1e-3))
 FRICTION_REGULARISATION = wp.constant(f64(1e-3))
 ZERO, ONE, TINY = wp.constant(f64(0.0)), wp.constant(f64(1.0)), wp.constant(f64(1e-30))
@@ -18,7 +20,7 @@ ZERO, ONE, TINY = wp.constant(f64(0.0)), wp.constant(f64(1.0)), wp.constant(f64(
 
 @wp.struct
 class Velocities:
-    """Of the bodies of each scene."""
+    """Velocities of the bodies of each scene."""
 
     linear: wp.array2d[wp.vec3d]  # of the centres of mass [m/s]
     angular: wp.array2d[wp.vec3d]  # [rad/s]
@@ -30,12 +32,12 @@ class BodyProperties:
 
     mass: wp.array2d[float]  # [kg]
     inertia: wp.array2d[wp.mat33]  # per unit of mass, rest orientation [m^2]
-    inverse: wp.array2d[wp.mat33]
-    friction: wp.array2d[float]
-    loss: wp.array2d[float]
-    acceleration: wp.array2d[wp.vec3]  # without contact, of the centres of mass [m/s^2]
-    twist: wp.array2d[wp.vec3]  # torque per unit of mass [m^2/s^2]
-    mass_fraction: wp.array3d[float]  # of keypoints
+    inverse: wp.array2d[wp.mat33]  # inverse of `inertia` [1/m^2]
+    friction: wp.array2d[float]  # coefficient of friction
+    loss: wp.array2d[float]  # loss factor; the coefficient of restitution is exp(-pi/2 loss)
+    acceleration: wp.array2d[wp.vec3]  # of the centre of mass without contact [m/s^2]
+    twist: wp.array2d[wp.vec3]  # torque per unit of mass without contact [m^2/s^2]
+    mass_fraction: wp.array3d[float]  # fraction of the body's mass at each keypoint
 
 
 @wp.struct
@@ -44,79 +46,79 @@ class Inertias:
 
     mass: wp.array2d[float]  # [kg]
     tensor: wp.array2d[wp.mat33d]  # [kg m^2]
-    inverse: wp.array2d[wp.mat33d]
+    inverse: wp.array2d[wp.mat33d]  # inverse of `tensor` [1/(kg m^2)]
     pinned: wp.array2d[wp.bool]
 
 
 @wp.struct
 class Contacts:
-    """The contacts of each scene, ordered by pairs of bodies a and b, or a = b for those of a with what is fixed."""
+    """Contacts of each scene, grouped by pairs of bodies a and b; a = b for contacts of a with the fixed planes."""
 
-    first: wp.array2d[int]  # contact of each pair a * bodies + b; one more for the end
-    active: wp.array2d[int]  # pairs with contacts
+    first: wp.array2d[int]  # first contact of pair a * bodies + b; one more entry for the end
+    active: wp.array2d[int]  # pairs that have contacts
     active_count: wp.array[int]
     a: wp.array2d[int]
     b: wp.array2d[int]
     normal: wp.array2d[wp.vec3d]  # from b to a
-    arm_a: wp.array2d[wp.vec3d]  # from the centres of mass [m]
-    arm_b: wp.array2d[wp.vec3d]
-    target: wp.array2d[f64]  # least normal speed of a relative to b after the step [m/s]
-    resting: wp.array2d[f64]  # the same of a contact that does not rebound
-    least: wp.array2d[f64]  # normal speed below which it rebounds [m/s]
-    gained: wp.array2d[f64]  # normal speed that other forces give until the middle of the step [m/s]
+    arm_a: wp.array2d[wp.vec3d]  # contact point relative to the centre of mass of a [m]
+    arm_b: wp.array2d[wp.vec3d]  # contact point relative to the centre of mass of b [m]
+    target: wp.array2d[f64]  # smallest normal speed of a relative to b that is allowed after the step [m/s]
+    resting: wp.array2d[f64]  # `target` of a contact that does not rebound [m/s]
+    least: wp.array2d[f64]  # normal speed below which the contact rebounds [m/s]
+    gained: wp.array2d[f64]  # normal speed added by other forces up to the middle of the step [m/s]
     restitution: wp.array2d[f64]
     friction: wp.array2d[f64]
-    R_n: wp.array2d[f64]
-    R_t: wp.array2d[f64]
-    impulse: wp.array2d[wp.vec3d]  # on a [N s]; the result
-    total: wp.array2d[wp.vec3d]  # that of all turns of impacts
+    R_n: wp.array2d[f64]  # normal regularisation
+    R_t: wp.array2d[f64]  # friction regularisation
+    impulse: wp.array2d[wp.vec3d]  # impulse on a [N s]; the result
+    total: wp.array2d[wp.vec3d]  # sum of the impulses over all turns (`contact_turns`) [N s]
 
 
 @wp.struct
 class Decomposition:
-    """The Hessian of each scene, replaced by its LDL' decomposition."""
+    """The Hessian of each scene, overwritten by its LDL' decomposition."""
 
-    H: wp.array2d[f64]  # lower triangle of the Hessian, and below it the negative gradient
-    inverse: wp.array2d[f64]  # of the diagonal of D
+    H: wp.array2d[f64]  # lower triangle of the Hessian; its extra last row is the negative gradient
+    inverse: wp.array2d[f64]  # reciprocals of the diagonal of D
 
 
 @wp.struct
 class SolverMemory:
-    """What the solver computes in between."""
+    """Intermediate results of the solver."""
 
-    bound: wp.array2d[f64]  # of the friction of each contact
-    relative: wp.array2d[wp.vec3d]  # velocity of a relative to b at each contact
-    along: wp.array2d[wp.vec3d]  # its change by a whole step
-    matrices: wp.array3d[wp.mat33d]  # of each contact, see `_evaluate`
-    vectors: wp.array3d[wp.vec3d]
-    pair_matrices: wp.array3d[wp.mat33d]  # their sums over the contacts of each pair
-    pair_vectors: wp.array3d[wp.vec3d]
-    step: Velocities
-    before: Velocities
+    bound: wp.array2d[f64]  # upper bound of the friction impulse of each contact [N s]
+    relative: wp.array2d[wp.vec3d]  # velocity of a relative to b at each contact [m/s]
+    along: wp.array2d[wp.vec3d]  # change of `relative` by a full Newton step [m/s]
+    matrices: wp.array3d[wp.mat33d]  # matrix terms of each contact, see `_evaluate`
+    vectors: wp.array3d[wp.vec3d]  # vector terms of each contact, see `_evaluate`
+    pair_matrices: wp.array3d[wp.mat33d]  # sums of `matrices` over the contacts of each pair
+    pair_vectors: wp.array3d[wp.vec3d]  # sums of `vectors` over the contacts of each pair
+    step: Velocities  # Newton step
+    before: Velocities  # velocities at the start of a round of the fixed-point iteration
     decomposition: Decomposition
-    order: wp.array2d[int]  # of the bodies in the Hessian, in which those that touch are near each other
-    rank: wp.array2d[int]  # of each body in it
-    first_rank: wp.array2d[int]  # least rank that the body of each rank is coupled to
-    last_rank: wp.array2d[int]  # largest rank whose `first_rank` is not larger
-    partial: wp.array2d[f64]  # results of the threads
+    order: wp.array2d[int]  # body of each rank; the order of bodies in the Hessian, with small bandwidth
+    rank: wp.array2d[int]  # rank of each body; the inverse of `order`
+    first_rank: wp.array2d[int]  # lowest rank that the body of each rank is coupled to
+    last_rank: wp.array2d[int]  # for each rank, the highest rank whose `first_rank` is not above it
+    partial: wp.array2d[f64]  # partial results of the threads, for reductions
 
 
 @wp.struct
 class ContactSolver:
-    """The contacts of each scene, the bodies that they are between, and what their solution takes."""
+    """Contacts and bodies of each scene, with the velocities and working memory of the solver."""
 
     contacts: Contacts
     inertia: Inertias
-    velocities: Velocities  # near the solution at first, then those after the step; 0 of pinned bodies
-    free: Velocities  # those without contact; 0 of pinned bodies
-    impacted: Velocities  # those at the start of the step, changed by impacts; 0 of pinned bodies
+    velocities: Velocities  # in: initial guess; out: velocities after the step; 0 for pinned bodies
+    free: Velocities  # velocities without contact; 0 for pinned bodies
+    impacted: Velocities  # velocities at the start of the step, then changed by impacts; 0 for pinned bodies
     memory: SolverMemory
 
 
 def contact_solver(device: str, scenes: int, bodies: int, contacts: int, group: int) -> ContactSolver:
-    """Room for `contacts` contacts in each scene, and for their solution by `group` threads for each scene.
+    """Allocate a solver for up to `contacts` contacts per scene, with `group` threads per scene.
 
-    Masses and what is pinned are to be filled in.
+    The caller sets `inertia.mass` and `inertia.pinned`.
     """
     b, pairs, n = scenes, bodies * bodies, 6 * bodies
     out = ContactSolver()
@@ -139,7 +141,7 @@ def contact_solver(device: str, scenes: int, bodies: int, contacts: int, group: 
 
 @wp.func
 def effective_response(inertia: Inertias, scene: int, body: int, arm: wp.vec3d) -> f64:
-    """Speed that a unit impulse at `arm` gives its point, the mean over all directions."""
+    """Inverse effective mass at `arm` [1/kg]: the speed per unit impulse, averaged over all directions."""
     if inertia.pinned[scene, body]:
         return ZERO
     K = wp.skew(arm)
@@ -155,13 +157,13 @@ def contact_count(c: Contacts, scene: int) -> int:
 
 @wp.func
 def has_contacts(c: Contacts, scene: int, pair: int) -> bool:
-    """Whether a pair of bodies has any."""
+    """Whether a pair of bodies has contacts."""
     return c.first[scene, pair + 1] > c.first[scene, pair]
 
 
 @wp.func
 def relative_velocity(c: Contacts, v: Velocities, scene: int, i: int) -> wp.vec3d:
-    """Velocity of a relative to b at a contact."""
+    """Velocity of body a relative to body b at contact i [m/s]."""
     a = c.a[scene, i]
     b = c.b[scene, i]
     out = v.linear[scene, a] + wp.cross(v.angular[scene, a], c.arm_a[scene, i])
@@ -172,13 +174,13 @@ def relative_velocity(c: Contacts, v: Velocities, scene: int, i: int) -> wp.vec3
 
 @wp.func
 def normal_impulse(c: Contacts, scene: int, i: int, relative: wp.vec3d) -> f64:
-    """Impulse along the normal."""
+    """Impulse on body a along the contact normal [N s]."""
     return wp.max((c.target[scene, i] - wp.dot(relative, c.normal[scene, i])) / c.R_n[scene, i], ZERO)
 
 
 @wp.func
 def contact_impulse(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: f64) -> wp.vec3d:
-    """Impulse on body a at this relative velocity [N s]; its tangential part is at most `bound`."""
+    """Impulse on body a at a given relative velocity [N s]; the magnitude of its tangential part is at most `bound`."""
     n = c.normal[scene, i]
     slip = relative - wp.dot(relative, n) * n
     across = wp.min(ONE / c.R_t[scene, i], bound / wp.max(wp.length(slip), TINY))
@@ -187,7 +189,7 @@ def contact_impulse(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: 
 
 @wp.func
 def contact_hessian(c: Contacts, scene: int, i: int, relative: wp.vec3d, bound: f64) -> wp.mat33d:
-    """Derivative of the negative impulse by the relative velocity."""
+    """Derivative of the negative impulse with respect to the relative velocity."""
     n = c.normal[scene, i]
     slip = relative - wp.dot(relative, n) * n
     speed = wp.max(wp.length(slip), TINY)

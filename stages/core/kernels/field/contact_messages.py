@@ -1,8 +1,8 @@
-"""Contact message passing: the networks over the contact points listed by `broad_phase`.
+"""Contact message passing: the networks that act on the contact points listed by `broad_phase`.
 
 `project_embeddings` maps object embeddings into the first layers, `encode_messages` encodes features as weighted
-messages, `aggregate_messages` averages them for each contact and object, `update_contacts` combines both sides of a
-contact, and `decode_forces` decodes accelerations, forces and torques.
+messages, `aggregate_messages` averages the messages of each contact and object, `update_contacts` combines both sides
+of a contact, and `decode_forces` decodes accelerations, forces and torques.
 Reference: `stages.core.models.field.contact_forces`. Written in Triton (see `compilers`).
 """
 
@@ -31,11 +31,11 @@ from stages.core.kernels.field.vec3 import add, cross, dot, load3, scale3, store
 class EmbeddingLayers(NamedTuple):
     """Layers (weight, bias) that map object embeddings into the first layers of the other networks."""
 
-    own: tuple  # of contacts between objects, as the next
-    partner: tuple | None
-    plane: tuple  # of contacts with floor and walls
+    own: tuple  # for contacts between objects: the object's own embedding
+    partner: tuple | None  # for contacts between objects: the other object's embedding
+    plane: tuple  # for contacts with floor and walls
     deformation: tuple
-    H: tl.constexpr  # hidden columns
+    H: tl.constexpr  # hidden width
 
 
 class ContactEncoder(NamedTuple):
@@ -55,16 +55,16 @@ class ContactDecoder(NamedTuple):
 
 
 class EncoderLayers(NamedTuple):
-    """The encoders of contacts between objects, and with floor and walls."""
+    """Encoders of contacts between objects, and of contacts with floor and walls."""
 
     pairs: ContactEncoder
     planes: ContactEncoder
     H: tl.constexpr
-    PRECISION: tl.constexpr  # of products
+    PRECISION: tl.constexpr  # input precision of tl.dot
 
 
 class StatusLayers(NamedTuple):
-    """Layers (weight, bias) of an object's status vector, and from it to the friction of the floor."""
+    """Layers (weight, bias) that compute an object's status vector, and from it the friction of the floor."""
 
     update: tuple
     friction: tuple
@@ -72,7 +72,7 @@ class StatusLayers(NamedTuple):
 
 
 class ContextLayers(NamedTuple):
-    """Layers (weight, bias) that update a contact between objects, or with floor and walls, and its projection."""
+    """Layers (weight, bias) that update and project contacts between objects, and contacts with floor and walls."""
 
     pair_update: tuple
     pair_projection: tuple
@@ -82,7 +82,7 @@ class ContextLayers(NamedTuple):
 
 
 class DecoderLayers(NamedTuple):
-    """The decoders of contacts between objects, and with floor and walls."""
+    """Decoders of contacts between objects, and of contacts with floor and walls."""
 
     pairs: ContactDecoder
     planes: ContactDecoder
@@ -91,31 +91,33 @@ class DecoderLayers(NamedTuple):
 
 
 class Messages(NamedTuple):
-    """What the networks make of the contact points. Blocks are of ROWS contact points."""
+    """Intermediate and final outputs of the contact networks. A block has ROWS contact points."""
 
-    offset: Tensor  # (b o, o + 2, h) embeddings in the first layers: of each list, and of the deformation network
-    message: Tensor  # (b o, slots, h)
-    weight: Tensor  # (b o, slots)
-    block_sum: Tensor  # (b o, blocks, h) weighted sum of messages
-    block_weight: Tensor  # (b o, blocks)
-    mean: Tensor  # (b o, o + 1, h) of each list
-    scale: Tensor  # (b o, o + 1) factor of its weights
-    status: Tensor  # (b o, h) of each object
-    friction: Tensor  # (b o) [m/s]
+    offset: Tensor  # (b o, o + 2, h) embeddings' part of the first layer: for each list, then the deformation network
+    message: Tensor  # (b o, slots, h) message of each contact point
+    weight: Tensor  # (b o, slots) weight of each message
+    block_sum: Tensor  # (b o, blocks, h) weighted sum of the messages of each block
+    block_weight: Tensor  # (b o, blocks) sum of the weights of each block
+    mean: Tensor  # (b o, o + 1, h) mean message of each list
+    scale: Tensor  # (b o, o + 1) normalisation factor of the weights of each list
+    status: Tensor  # (b o, h) status vector of each object
+    friction: Tensor  # (b o) [m/s] friction threshold speed due to the floor
     context: Tensor  # (b o, o + 1, h) input of the second layer for the points of each list
-    wrenches: Tensor  # (b o, blocks, WRENCH_SIZE) force and torque, per unit of (reduced) mass
+    wrenches: Tensor  # (b o, blocks, WRENCH_SIZE) force and torque of each block, per unit of (reduced) mass
 
 
 @triton.jit
 def _project(layer, x, H: tl.constexpr):
-    """Layer (weight, bias) from H to H columns, of one row."""
+    """Apply a layer (weight, bias) from H to H columns to one row."""
     return matvec(layer[0], x, 0, H, H) + tl.load(layer[1] + tl.arange(0, H))
 
 
 @triton.jit
 def project_embeddings(embedding, o, layers, offset):
-    """Contribution of the object embeddings to the first layer of each contact; in the row after all contacts, to the
-    first layer of the deformation network: `offset`."""
+    """Compute the object embeddings' part of the first layer of each contact.
+
+    Writes `offset`, whose last row of each object belongs to the first layer of the deformation network.
+    """
     H: tl.constexpr = layers.H
     i, k = tl.program_id(0), tl.program_id(1)
     m, h = o - 1, tl.arange(0, H)
@@ -132,7 +134,7 @@ def project_embeddings(embedding, o, layers, offset):
 
 @triton.jit
 def _encode(record, there, net, offset, H: tl.constexpr, PRECISION: tl.constexpr):
-    """Messages of a block of contact points, and their weights."""
+    """Return the messages of a block of contact points, and their weights."""
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
     y = invariant_layer(record, net.input_layer, net.VECTORS, net.SCALARS, H, PRECISION)
     y = silu(y + tl.load(offset + h)[None, :])
@@ -148,7 +150,7 @@ def _encode(record, there, net, offset, H: tl.constexpr, PRECISION: tl.constexpr
 
 @triton.jit
 def encode_messages(lists, layers, messages):
-    """Message and weight of each contact point; weighted sums over each block."""
+    """Compute the message and weight of each contact point, and their weighted sums over each block."""
     H: tl.constexpr = layers.H
     i, o, slots = tl.program_id(0), lists.o, lists.slots
     m, slot = o - 1, tl.program_id(1) * ROWS
@@ -173,7 +175,7 @@ def encode_messages(lists, layers, messages):
 
 @triton.jit
 def aggregate_messages(embedding, lists, layers, messages, C: tl.constexpr):
-    """Mean message of each contact of an object, its status vector from all of them, and the floor's friction."""
+    """Compute the mean message of each contact of an object, its status vector, and the friction of the floor."""
     H: tl.constexpr = layers.H
     i, o, slots = tl.program_id(0), lists.o, lists.slots
     m, h, block = o - 1, tl.arange(0, H), tl.arange(0, lists.FLOOR_BLOCKS)
@@ -203,8 +205,10 @@ def aggregate_messages(embedding, lists, layers, messages, C: tl.constexpr):
 
 @triton.jit
 def update_contacts(o, layers, messages):
-    """Second-layer input of a contact's points, from both objects' mean messages of it and their status vectors:
-    `context`."""
+    """Compute the second-layer input `context` of a contact's points.
+
+    It depends on both objects' mean messages of the contact and on their status vectors.
+    """
     H: tl.constexpr = layers.H
     i, k = tl.program_id(0), tl.program_id(1)
     m, h = o - 1, tl.arange(0, H)
@@ -228,7 +232,7 @@ def update_contacts(o, layers, messages):
 
 @triton.jit
 def _decode(record, there, net, x, H: tl.constexpr, PRECISION: tl.constexpr):
-    """Accelerations of a block of contact points (3 vectors of ROWS), from the inputs x of the second layer."""
+    """Return the accelerations of a block of contact points (3 components of ROWS), from second-layer inputs x."""
     x = silu(linear_layer(silu(x), net.layers[0], H, H, H, PRECISION))
     x = linear_layer(x, net.layers[1], net.VECTORS, H, PADDED_VECTORS, PRECISION)
     return weighted_vectors(record, there, x, net.VECTORS)
@@ -236,8 +240,10 @@ def _decode(record, there, net, x, H: tl.constexpr, PRECISION: tl.constexpr):
 
 @triton.jit
 def decode_forces(lists, layers, messages, C: tl.constexpr):
-    """Decode the acceleration of each contact point, and force and torque of each block (`wrenches`): per unit of
-    mass, for pairs of objects of reduced mass."""
+    """Decode the acceleration of each contact point, and the force and torque of each block (`wrenches`).
+
+    Values are per unit of mass; for contacts between objects, per unit of reduced mass.
+    """
     H: tl.constexpr = layers.H
     i, o, n, slots = tl.program_id(0), lists.o, lists.n, lists.slots
     m, slot = o - 1, tl.program_id(1) * ROWS
@@ -265,7 +271,7 @@ def decode_forces(lists, layers, messages, C: tl.constexpr):
             along, weight = dot(a, inward), tl.maximum(w, 1e-9)
             pull = along / weight
             softplus = tl.maximum(pull, 0.0) + tl.log(1 + tl.exp(-tl.abs(pull)))
-            push = weight * softplus  # floor and walls only push
+            push = weight * softplus  # floor and walls never attract
             push = push / (1 + tl.maximum(separation_speed, 0.0) / C.SEPARATION_SPEED)
             a = add(a, scale3(push - along, inward))
         own = tl.load(lists.point + at + r, mask=listed, other=0)

@@ -1,4 +1,4 @@
-"""Contact forces of rigid bodies spread over the keypoints that touch, and summed for each body."""
+"""Distribution of the contact forces of rigid bodies over the touching keypoints, and their sums for each body."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from stages.core.kernels.field.contact_impulses import BodyProperties, Contacts
 from stages.core.kernels.field.contact_search import CollisionWorld, Found
 from stages.core.kernels.field.groups import GroupThread
 
-PATCH = wp.constant(0.02)  # samples with gaps this much larger than the least share a contact's force [m]
+PATCH = wp.constant(0.02)  # samples whose gap exceeds a pair's smallest gap by less than this share its force [m]
 
 
 @wp.struct
 class Patches:
-    """How the contacts of each pair are spread over its nodes, the samples that touch: at x each bears
-    share + turn x (x - centre).
+    """Distribution of each pair's contact impulses over its nodes, which are the samples with gaps below `limit`.
+
+    A node at x bears share + turn x (x - centre).
     """
 
-    limit: wp.array2d[float]  # of the nodes' gaps [m]
-    centre: wp.array2d[wp.vec3]
-    share: wp.array2d[wp.vec3]
-    turn: wp.array2d[wp.vec3]
-    accelerations: wp.array3d[wp.vec3]  # of keypoints in the bodies' frames; the result
-    load: wp.array2d[wp.vec3]  # sum of all impulses on each body; the result
-    moment: wp.array2d[wp.vec3]  # that about its centre of mass
+    limit: wp.array2d[float]  # upper bound of the nodes' gaps [m]
+    centre: wp.array2d[wp.vec3]  # mean position of the nodes [m]
+    share: wp.array2d[wp.vec3]  # impulse per node [N s]
+    turn: wp.array2d[wp.vec3]  # transmits the angular impulse about `centre`
+    accelerations: wp.array3d[wp.vec3]  # mean accelerations of the keypoints, body frames [m/s^2]; result
+    load: wp.array2d[wp.vec3]  # sum of all contact impulses on each body [N s]; result
+    moment: wp.array2d[wp.vec3]  # sum of their moments about the centre of mass [N m s]; result
 
 
 @wp.func
 def single(x: wp.vec3d) -> wp.vec3:
-    """The vector in single precision."""
+    """Convert a vector to single precision."""
     return wp.vec3(float(x[0]), float(x[1]), float(x[2]))
 
 
@@ -47,7 +48,7 @@ def _least_gap(found: Found, scene: int, pair: int) -> float:
 
 @wp.func
 def sum_patch(w: CollisionWorld, c: Contacts, patches: Patches, scene: int, pair: int):
-    """Force and torque of the contacts of a pair, and the nodes that they are spread over."""
+    """Sum the contact impulses of a pair, and compute their distribution over the nodes."""
     a = pair // w.surfaces.near.shape[0]
     limit = _least_gap(w.found, scene, pair) + PATCH
     nodes = int(0)
@@ -73,7 +74,7 @@ def sum_patch(w: CollisionWorld, c: Contacts, patches: Patches, scene: int, pair
     patches.limit[scene, pair] = limit
     patches.centre[scene, pair] = centre
     patches.share[scene, pair] = force / float(wp.max(nodes, 1))
-    # a multiple of the identity: nodes on a line cannot bear a torque about it
+    # regularise by a multiple of the identity: collinear nodes cannot transmit a torque about their line
     extra = 1.0e-2 * wp.trace(moment) + 1.0e-9
     patches.turn[scene, pair] = wp.inverse(moment + extra * wp.identity(3, dtype=float)) * torque
 
@@ -82,9 +83,10 @@ def sum_patch(w: CollisionWorld, c: Contacts, patches: Patches, scene: int, pair
 def spread(
     bodies: BodyProperties, w: CollisionWorld, c: Contacts, patches: Patches, thread: GroupThread, weight: float
 ):  # fmt: skip
-    """Add the accelerations of the keypoints by all contacts, times `weight`; threads share those of each body.
+    """Add the accelerations of the keypoints due to all contacts, times `weight`.
 
-    Forces and torques are divided among the nodes as by interpolation elements (RBE3) of finite-element codes.
+    Force and torque are distributed over the nodes as by the RBE3 interpolation elements of finite-element codes. The
+    keypoints of each body are divided among the threads.
     """
     scene = thread.scene
     count = w.surfaces.near.shape[0]
@@ -114,7 +116,7 @@ def spread(
 
 @wp.func
 def add_load(c: Contacts, patches: Patches, scene: int, i: int, pair: int):
-    """Add the impulses of a pair's contacts on body i."""
+    """Add the impulses of a pair's contacts on body i to its load and moment."""
     force = wp.vec3d()
     moment = wp.vec3d()
     for k in range(c.first[scene, pair], c.first[scene, pair + 1]):

@@ -1,9 +1,10 @@
-"""Contact points of rigid bodies, a group of threads for each scene: samples of one surface near another.
+"""Contact search and contact reduction for rigid bodies, one group of threads per scene.
 
-Of the samples of a body near another one, or near a plane, those are kept that span the contact in eight directions
-across its normal, and the deepest: for each of six directions of the normal, in world axes. The others lie within the
-polygon of these and would bear a load that these can bear. A sample counts for less by ten times its gap, so that those
-that touch come before those that only may.
+Contact points are samples of one body's surface near another body or a plane. The samples of a pair are sorted by the
+world axis (of six) closest to the contact normal. For each axis, contact reduction keeps the deepest sample and the
+extreme samples in eight tangential directions; the other samples lie within the polygon of these, which can bear their
+load. The extent of a sample along a direction is reduced by ten times its gap, so that touching samples take precedence
+over those that are only close.
 
 Source: manifold reduction by extremes: Moravanszky and Terdiman 2004, "Fast contact reduction for dynamics simulation".
 """
@@ -27,32 +28,32 @@ from stages.core.kernels.field.near_points import (
 from stages.core.kernels.field.surface_lookup import SurfaceArrays, beyond_grid, nearest_node
 
 SIDES = wp.constant(6)  # directions of normals, and of planes: +x, +y, +z, -x, -y, -z
-EXTREMES = wp.constant(9)  # kept of each: in eight directions, and the deepest
-SLOTS = wp.constant(6 * 9)
+EXTREMES = wp.constant(9)  # contacts kept per direction of the normal: eight tangential extremes, and the deepest
+SLOTS = wp.constant(6 * 9)  # contact slots of a pair
 NONE = wp.constant(-1)
-DIAGONAL = wp.constant(0.70710678)
-GAP_WEIGHT = wp.constant(10.0)  # of a gap against the distance along a direction
-AHEAD = wp.constant(9)  # slot of the point of a ball that meets another body in a step; that of the nearest one is 0
+DIAGONAL = wp.constant(0.70710678)  # 1 / sqrt(2)
+GAP_WEIGHT = wp.constant(10.0)  # factor by which a sample's gap reduces its extent along a direction
+AHEAD = wp.constant(9)  # slot of the point where a ball hits another body during a step; its nearest point has slot 0
 
 
 @wp.struct
 class Found:
-    """What was found for each pair of bodies a and b; that of a body with itself is for the planes around it."""
+    """Results of the search for each pair of bodies a and b; the pair of a body with itself is for its planes."""
 
-    possible: wp.array2d[wp.bool]  # whether both are near each other
-    side: wp.array3d[wp.int8]  # of the normal at each sample; NONE where it is not near
-    gap: wp.array3d[float]  # of each sample [m]
-    other: wp.array3d[int]  # keypoint of b near each sample
-    near: wp.array3d[int]  # samples that are near, one after the other
-    near_count: wp.array2d[int]
-    score: wp.array2d[float]  # of each slot
-    row: wp.array2d[int]  # sample in each slot
-    count: wp.array2d[int]  # contacts
+    possible: wp.array2d[wp.bool]  # whether the bodies are close enough for contact (broad phase)
+    side: wp.array3d[wp.int8]  # side of the contact normal at each sample; NONE where the sample is not near
+    gap: wp.array3d[float]  # gap of each near sample [m]
+    other: wp.array3d[int]  # keypoint of b nearest to each near sample
+    near: wp.array3d[int]  # compact list of the near samples
+    near_count: wp.array2d[int]  # length of `near`
+    score: wp.array2d[float]  # extent of the sample in each slot along the slot's direction
+    row: wp.array2d[int]  # sample in each slot; NONE if empty
+    count: wp.array2d[int]  # number of contacts
 
 
 @wp.struct
 class CollisionWorld:
-    """The surfaces of the bodies of each scene, where these are, and what of them is near others."""
+    """Surfaces and motion of the bodies of each scene, and the results of the search."""
 
     surfaces: SurfaceArrays
     motion: BodyMotion
@@ -61,7 +62,7 @@ class CollisionWorld:
 
 @wp.func
 def _side_of(normal: wp.vec3) -> int:
-    """The axis nearest to a normal."""
+    """Index (see SIDES) of the signed axis closest to a normal."""
     axis = int(0)
     for i in range(1, 3):
         if wp.abs(normal[i]) > wp.abs(normal[axis]):
@@ -71,11 +72,11 @@ def _side_of(normal: wp.vec3) -> int:
 
 @wp.func
 def _possible(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> bool:
-    """Whether contacts of body a with b, or with the planes if b = a, are to be looked for."""
+    """Broad phase: whether body a may touch body b, or the planes if b = a."""
     if motion.pinned[scene, a] and (a == b or motion.pinned[scene, b]):
         return False
     if a != b and s.radius[b] > 0.0 and (s.radius[a] == 0.0 or b < a):
-        return False  # it is a contact of b with a
+        return False  # treated as a contact of ball b with a
     com = motion.com[scene, a]
     if a != b:
         reach = s.reach[a] + s.reach[b] + motion.margin[scene, a] + motion.margin[scene, b]
@@ -93,7 +94,7 @@ def _margin(motion: BodyMotion, scene: int, a: int, b: int) -> float:
 
 @wp.func
 def _look_at(w: CollisionWorld, scene: int, pair: int, q: int):
-    """Sample q of a pair: its gap and the side of its normal, if it is near."""
+    """Narrow phase for sample q of a pair: set its gap and the side of its normal if it is near."""
     a = pair // w.surfaces.near.shape[0]
     b = pair % w.surfaces.near.shape[0]
     w.found.side[scene, pair, q] = wp.int8(NONE)
@@ -101,7 +102,7 @@ def _look_at(w: CollisionWorld, scene: int, pair: int, q: int):
         return
     margin = _margin(w.motion, scene, a, b)
     if a == b:
-        least = margin  # of a sample near several planes the nearest one counts
+        least = margin  # a sample near several planes touches only the nearest one
         for side in range(SIDES):
             gap = plane_gap(w.motion, scene, a, side, sample_at_plane(w.surfaces, w.motion, scene, a, side, q))
             if gap < least:
@@ -131,7 +132,7 @@ def _list_near(w: CollisionWorld, scene: int, pair: int):
 
 @wp.func
 def _keep_extremes(w: CollisionWorld, scene: int, pair: int, k: int):
-    """Fill the slots of the k-th direction on all sides."""
+    """Fill the slots of the k-th direction for all sides; the last direction is depth."""
     a = pair // w.surfaces.near.shape[0]
     for side in range(SIDES):
         w.found.row[scene, pair * SLOTS + side * EXTREMES + k] = NONE
@@ -159,7 +160,10 @@ def _keep_extremes(w: CollisionWorld, scene: int, pair: int, k: int):
 
 @wp.func
 def _count_contacts(w: CollisionWorld, scene: int, pair: int):
-    """Empty slots whose sample is in an earlier one of the same side, and count the others; a ball has one or two."""
+    """Clear slots whose sample is in an earlier slot of the same side, and count the rest.
+
+    A ball fills its slots here: with another body it has up to two contacts, with each plane one.
+    """
     a = pair // w.surfaces.near.shape[0]
     b = pair % w.surfaces.near.shape[0]
     count = int(0)
@@ -185,7 +189,7 @@ def _count_contacts(w: CollisionWorld, scene: int, pair: int):
 
 @wp.func
 def search(w: CollisionWorld, thread: GroupThread):
-    """Find the contacts of all pairs: their slots and number, and the samples that are near."""
+    """Find the contacts of all pairs: fill their slots, count them, and list the near samples."""
     scene = thread.scene
     bodies = w.surfaces.near.shape[0]
     samples = w.surfaces.near.shape[1]
@@ -216,7 +220,7 @@ def search(w: CollisionWorld, thread: GroupThread):
 
 @wp.func
 def contact_in_slot(w: CollisionWorld, scene: int, pair: int, slot: int) -> NearPoint:
-    """The contact that `search` has put there."""
+    """Return the contact that `search` has put in a slot of a pair."""
     a = pair // w.surfaces.near.shape[0]
     b = pair % w.surfaces.near.shape[0]
     q = w.found.row[scene, pair * SLOTS + slot]

@@ -1,14 +1,14 @@
-"""Contacts of rigid bodies, solved for the velocities at the end of a step: no penetration, and Coulomb's friction.
+"""Contact solver for rigid bodies: velocities at the end of a step without penetration, with Coulomb friction.
 
-With M for the bodies' inertia, the velocities v minimise the convex function
+With the mass matrix M, the velocities v minimise the convex function
 
-    (v - v0)' M (v - v0) / 2 + sum of the potentials of the contacts' impulses,
+    (v - v0)' M (v - v0) / 2 + sum of the potentials of the contact impulses,
 
-where v0 are the velocities without contact. The impulse along a normal, (target - normal speed) / R_n, never pulls;
-that across it, -slip / R_t, is at most friction times the normal impulse in the minimum before, a fixed point that few
-rounds reach. R_n and R_t are small fractions of the inverse effective mass, so that contacts are as stiff as a step
-resolves. Minimised by Newton's method with a line search, in double precision, by the threads of one scene; every sum
-has a fixed order.
+where v0 are the velocities without contact. The normal impulse is (target - normal speed) / R_n, and never attractive.
+The friction impulse is -slip / R_t, bounded by the coefficient of friction times the normal impulse at the previous
+minimum; this fixed-point iteration converges in a few rounds. R_n and R_t are small fractions of the inverse effective
+mass, so contacts are as stiff as the time step resolves. The minimum is found by Newton's method with a line search in
+double precision, by the threads of one scene; every sum has a fixed order, so that results are reproducible.
 Sources: Castro, Permenter and Han 2022, "An unconstrained convex formulation of compliant contact"; friction bounded by
 the normal forces before: Castro et al. 2023, "A theory of irrotational contact fields".
 """
@@ -32,15 +32,18 @@ from stages.core.kernels.field.groups import GroupThread, wait_for_group
 from stages.core.kernels.field.newton_system import assemble, back_substitute, factorise, sort_bodies
 
 f64 = wp.float64
-ROUNDS = wp.constant(5)  # of the fixed point, at most
-ITERATIONS = wp.constant(20)  # of Newton's method in each round, at most
-SEARCHES = wp.constant(20)  # of the line search, at most
-SEARCH_TOLERANCE = wp.constant(f64(0.1))  # of the derivative along the step at its start
-TOLERANCE = wp.constant(f64(1e-6))  # change of velocities at which both end [m/s]
+ROUNDS = wp.constant(5)  # maximum number of rounds of the fixed-point iteration for friction
+ITERATIONS = wp.constant(20)  # maximum number of Newton steps per round
+SEARCHES = wp.constant(20)  # maximum number of iterations of a line search
+SEARCH_TOLERANCE = wp.constant(f64(0.1))  # the line search ends at this fraction of the initial slope along the step
+TOLERANCE = wp.constant(f64(1e-6))  # velocity change at which Newton's method and the rounds end [m/s or rad/s]
 
 
 def _over_group(combine: Callable) -> wp.Function:
-    """A function that gives all threads their values and 0, `combine`d in their order; at most `count` have any."""
+    """Return a reduction over the threads of a group: `combine` of 0 and the values of the first `count` threads.
+
+    All threads get the result; the values are combined in the order of the threads.
+    """
 
     @wp.func
     def over_group(memory: SolverMemory, thread: GroupThread, count: int, value: f64) -> f64:
@@ -60,7 +63,7 @@ _total, largest = _over_group(wp.add), _over_group(wp.max)
 
 @wp.func
 def _slope(s: ContactSolver, thread: GroupThread, size: f64, inertial: f64) -> f64:
-    """Derivative of the function along the step, at this size of it; `inertial` is the part of the inertia."""
+    """Derivative of the objective along the Newton step, at a multiple `size` of it; `inertial` is the mass term."""
     scene = thread.scene
     count = contact_count(s.contacts, scene)
     slope = f64(0.0)
@@ -73,7 +76,7 @@ def _slope(s: ContactSolver, thread: GroupThread, size: f64, inertial: f64) -> f
 
 @wp.func
 def _step_size(s: ContactSolver, thread: GroupThread) -> f64:
-    """Where the derivative along the step vanishes, at most 1."""
+    """Line search: the multiple of the Newton step, at most 1, at which the derivative along it vanishes."""
     scene = thread.scene
     bodies = s.memory.rank.shape[1]
     for i in range(thread.lane, contact_count(s.contacts, scene), thread.lanes):
@@ -95,12 +98,12 @@ def _step_size(s: ContactSolver, thread: GroupThread) -> f64:
     slope_low = _slope(s, thread, low, at_zero)
     high = f64(1.0)
     slope_high = _slope(s, thread, high, at_zero + gain)
-    if slope_high <= ZERO or slope_low >= ZERO:  # the latter by rounding, at the minimum
+    if slope_high <= ZERO or slope_low >= ZERO:  # the latter only by rounding errors at the minimum
         return high
     size = high
     side = int(0)
     limit = wp.abs(slope_low) * SEARCH_TOLERANCE
-    for _ in range(SEARCHES):  # false position, with the end that stays counting half (Dowell and Jarratt 1971)
+    for _ in range(SEARCHES):  # false position that halves the slope at an end kept twice (Dowell and Jarratt 1971)
         size = low + (high - low) * slope_low / (slope_low - slope_high)
         slope = _slope(s, thread, size, at_zero + size * gain)
         if wp.abs(slope) < limit:
@@ -122,7 +125,7 @@ def _step_size(s: ContactSolver, thread: GroupThread) -> f64:
 
 @wp.func
 def _newton_step(s: ContactSolver, thread: GroupThread) -> f64:
-    """Change the velocities by a step of Newton's method; the largest change."""
+    """Update the velocities by one Newton step; return the largest change."""
     scene = thread.scene
     bodies = s.memory.rank.shape[1]
     assemble(s, thread)
@@ -142,7 +145,7 @@ def _newton_step(s: ContactSolver, thread: GroupThread) -> f64:
 
 @wp.func
 def solve(s: ContactSolver, thread: GroupThread):
-    """Change the velocities to those after the step, and set the impulses of the contacts."""
+    """Replace the velocities by those after the step, and set the impulses of the contacts."""
     scene = thread.scene
     bodies = s.memory.rank.shape[1]
     if thread.lane == 0:
@@ -151,7 +154,7 @@ def solve(s: ContactSolver, thread: GroupThread):
     for i in range(thread.lane, count, thread.lanes):
         s.memory.bound[scene, i] = ZERO
     wait_for_group()
-    for k in range(ROUNDS):  # the first without friction
+    for k in range(ROUNDS):  # the first round has no friction
         if k > 0:
             for i in range(thread.lane, count, thread.lanes):
                 along = normal_impulse(s.contacts, scene, i, relative_velocity(s.contacts, s.velocities, scene, i))

@@ -1,8 +1,9 @@
-"""Impacts within a step, passed on in turns from contact to contact, as in Newton's cradle.
+"""Propagation of impacts from contact to contact within a step, as in Newton's cradle.
 
-Contacts that approach are solved for without those that merely touch, then those that this makes approach, and so on;
-at last all contacts that do not rebound are. In one solution of all contacts the last one of a row of balls would take
-only a part of the speed of the first. Source: Smith et al. 2012, "Reflections on simultaneous impact".
+Each turn solves the contacts that approach, without those that merely touch; their impulses may make others approach,
+which the next turn solves. The final turn solves all contacts without rebound. If all contacts were solved together,
+the last ball of a row would get only part of the speed of the first.
+Source: Smith et al. 2012, "Reflections on simultaneous impact".
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ from stages.core.kernels.field.contact_solve import largest, solve
 from stages.core.kernels.field.groups import GroupThread, wait_for_group
 
 f64 = wp.float64
-MAX_TURNS = wp.constant(20)  # a light body between heavy ones would need hundreds, so that none rebounds in the last
-APART = wp.constant(f64(-1e9))  # target of a contact that takes no part [m/s]
+# Maximum number of turns; no contact rebounds in the last one. A light body between heavy ones would need hundreds.
+MAX_TURNS = wp.constant(20)
+APART = wp.constant(f64(-1e9))  # target normal speed that excludes a contact from a turn [m/s]
 
 
 @wp.func
 def _set_targets(s: ContactSolver, thread: GroupThread, last: bool) -> bool:
-    """Whether contacts rebound in this turn; then these take part, else all."""
+    """Set the target speeds of a turn; return whether any contact rebounds in it.
+
+    If so, only rebounding contacts take part; otherwise all do, without rebound.
+    """
     scene = thread.scene
     count = contact_count(s.contacts, scene)
     rebounds = ZERO
@@ -43,9 +48,9 @@ def _set_targets(s: ContactSolver, thread: GroupThread, last: bool) -> bool:
 
 @wp.func
 def solve_in_turns(s: ContactSolver, thread: GroupThread):
-    """Change the velocities to those after the step, and set the impulses of the contacts.
+    """Replace the velocities by those after the step, and set the impulses of the contacts.
 
-    Changes `free` to the velocities after the last impacts.
+    Overwrites `free` with the velocities after the last impacts.
     """
     scene = thread.scene
     count = contact_count(s.contacts, scene)

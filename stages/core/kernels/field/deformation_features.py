@@ -1,4 +1,4 @@
-"""Deformation network at blocks of points: features of the displacements, and internal accelerations from them.
+"""Deformation network for blocks of points: features of the displacements, and the internal accelerations.
 
 Reference: `stages.core.models.field.deformation`. Written in Triton (see `compilers`).
 """
@@ -28,8 +28,8 @@ class DeformationLayers(NamedTuple):
 
     input_layer: tuple
     decoder: tuple
-    H: tl.constexpr  # hidden columns
-    PRECISION: tl.constexpr  # of products
+    H: tl.constexpr  # hidden width
+    PRECISION: tl.constexpr  # input precision of tl.dot
 
 
 @triton.jit
@@ -42,9 +42,10 @@ def _mean(averages, unit, n, mask, KIND: tl.constexpr, WHICH: tl.constexpr):
 
 @triton.jit
 def deformation_features(inputs, drifted, averages, unit, record):
-    """Feature vectors of a block of points in the body frame: values and differences to neighbourhood averages.
+    """Write the feature vectors of a block of points in the body frame: values and differences to neighbourhood means.
 
-    `averages` (b o, 9, 2, n) and their `unit` (b o, 9): of what `update_velocities` prepares, at two scales.
+    `averages` (b o, 9, 2, n) are the neighbourhood means, at two scales, of the fields that `update_velocities`
+    prepares, in units of `unit` (b o, 9).
     """
     i, block, blocks, n = tl.program_id(0), tl.program_id(1), tl.num_programs(1), inputs.n
     r = tl.arange(0, ROWS)
@@ -79,9 +80,10 @@ def deformation_features(inputs, drifted, averages, unit, record):
 
 @triton.jit
 def internal_accelerations(inputs, record, layers, offset, acceleration, C: tl.constexpr):
-    """Internal acceleration [m/s^2] of a block of points: springs, dampers and a driving term scaled by compliance.
+    """Compute the internal accelerations [m/s^2] of a block of points.
 
-    `offset` (b o, o + 2, h): of the first layers, see `Messages`.
+    They are the sum of springs, dampers and a driving term scaled by compliance. `offset` (b o, o + 2, h) is the
+    embeddings' part of the first layers, see `Messages`.
     """
     H: tl.constexpr = layers.H
     i, block, o, n = tl.program_id(0), tl.program_id(1), inputs.o, inputs.n

@@ -12,11 +12,11 @@ class GroupThread:
     """One of the threads that work on a scene."""
 
     scene: int
-    lane: int  # its number in the group
-    lanes: int  # threads of the group
+    lane: int  # index within the group
+    lanes: int  # number of threads in the group
 
 
 @wp.func_native(by_device("__syncthreads();", ""))
 def wait_for_group():
-    """Wait until all threads of the group are here; what they wrote before can then be read by all."""
+    """Barrier for the threads of the group; writes before it are visible to all of them after it."""
     ...

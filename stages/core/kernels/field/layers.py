@@ -1,16 +1,16 @@
-"""Network layers in Triton kernels, for blocks of rows, with a rotation-invariant first layer.
+"""Network layers for Triton kernels, applied to blocks of rows, with a rotation-invariant first layer.
 
-The input of a block of ROWS rows is a record: a column of ROWS numbers for each component, x of all MAX_VECTORS
-vectors first, then y, then z, then scalars.
+The input of a block of ROWS rows is a record with one column of ROWS numbers per component: first x of all MAX_VECTORS
+vectors, then y, then z, then the scalars.
 """
 
 import triton
 import triton.language as tl
 
-ROWS = tl.constexpr(64)  # of a block
+ROWS = tl.constexpr(64)  # rows of a block
 MAX_VECTORS = tl.constexpr(12)  # vectors in a record
 FIRST_SCALAR = tl.constexpr(36)  # column of the first scalar
-PADDED_VECTORS = tl.constexpr(16)  # outputs that weight vectors, padded to what tl.dot takes
+PADDED_VECTORS = tl.constexpr(16)  # outputs that weight vectors, padded to a size that tl.dot supports
 
 
 @triton.jit
@@ -21,14 +21,14 @@ def silu(x):
 
 @triton.jit
 def matvec(w, x, first, INNER: tl.constexpr, H: tl.constexpr):
-    """Columns `first` to `first` + H of a matrix (H, INNER), times x (H)."""
+    """Product of the columns `first` to `first` + H of a matrix (H, INNER) and x (H)."""
     o, i = tl.arange(0, H), tl.arange(0, H)
     return tl.sum(tl.load(w + o[:, None] * INNER + first + i[None, :]) * x[None, :], 1)
 
 
 @triton.jit
 def linear_layer(x, layer, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
-    """Linear layer (weight and bias) of a block of rows, from H columns to OUTER, padded to O."""
+    """Linear layer (weight, bias) on a block of rows, from H columns to OUTER columns padded to O."""
     w, b = layer
     i, o = tl.arange(0, H), tl.arange(0, O)
     W = tl.load(w + o[None, :] * H + i[:, None], mask=o[None, :] < OUTER, other=0.0)
@@ -39,7 +39,7 @@ def linear_layer(x, layer, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr
 def invariant_layer(
     record, layer, VECTORS: tl.constexpr, SCALARS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Linear layer over the asinh of all dot products of the first VECTORS vectors, and SCALARS scalars: (ROWS, H)."""
+    """Linear layer (ROWS, H) on the asinh of all dot products of the first VECTORS vectors, and SCALARS scalars."""
     w, b = layer
     PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
     r, h = tl.arange(0, ROWS), tl.arange(0, H)

@@ -1,7 +1,8 @@
-"""Points of rigid bodies near other bodies and planes: gaps and normals of contacts.
+"""Narrow phase for rigid bodies: gaps and normals of points of one body near another body or a plane.
 
-Contacts are found before bodies touch, up to the way of a step, and limit the velocity to the gap over the step.
-Samples and balls that would pass through a wall meet it at the first place of their way that is inside.
+Contacts are detected before bodies touch, up to the distance travelled in a step, and limit the approach speed to the
+gap divided by the step. A sample or ball that would pass through a thin wall makes contact at the first point of its
+path that is inside.
 Source: Stewart and Trinkle 1996, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions
 and Coulomb friction".
 """
@@ -13,35 +14,35 @@ import warp as wp
 from stages.core.geometry import surface_faces as faces
 from stages.core.kernels.field.surface_lookup import SurfaceArrays, closest_point, depth_at, first_inside, nearest_node
 
-NO_CONTACT = wp.constant(1.0e18)  # gap [m]
-MARGIN = wp.constant(0.05)  # gap up to which points count, in addition to the way of a step [m]; a tenth of an object
-# Least cosine of the angle at which two surfaces face each other in a contact; .58 for a cube standing on its corner.
+NO_CONTACT = wp.constant(1.0e18)  # gap that stands for "no contact" [m]
+MARGIN = wp.constant(0.05)  # gap up to which contacts are detected, plus the travel in a step [m]; a tenth of an object
+# Smallest cosine of the angle at which two surfaces must face each other to make contact; .58 for a cube on its corner.
 MIN_FACING = wp.constant(0.3)
 OPPOSED, CURVED, FACES = wp.constant(faces.OPPOSED), wp.constant(faces.CURVED), wp.constant(faces.FACES)
-STEP_OF_A_CELL = wp.constant(0.25)  # way of a sample in a step that matters for its contact, in nodes of the grid
-THINNEST = wp.constant(2.0)  # a way that may lead through a wall, in nodes of the grid: sheets have three voxels
-ON_SIDE = wp.constant(0.98)  # distance from the axis of a cylinder beyond which samples are on its side [radii]
-TURNED = wp.constant(0.5)  # least cosine of the angle by which a sample is moved around an axis
-SMALL = wp.constant(0.25)  # size of a body below which it may be between the samples of a cylinder [its size]
-LEANING = wp.constant(0.1)  # sine of the angle to an axis below which a direction is along it
-NO_DISTANCE = wp.constant(1e-6)  # in radii of a ball, that has no direction
+STEP_OF_A_CELL = wp.constant(0.25)  # travel of a sample in a step below which its contact ignores it [grid spacings]
+THINNEST = wp.constant(2.0)  # travel that may cross a wall and is swept [grid spacings]: sheets have three voxels
+ON_SIDE = wp.constant(0.98)  # distance from a cylinder's axis beyond which samples are on its lateral surface [radii]
+TURNED = wp.constant(0.5)  # smallest cosine of the angle by which a sample may be rotated about a cylinder's axis
+SMALL = wp.constant(0.25)  # size below which a body may lie between the samples of a cylinder [size of the cylinder]
+LEANING = wp.constant(0.1)  # sine of the angle to a cylinder's axis below which a direction counts as axial
+NO_DISTANCE = wp.constant(1e-6)  # distance from a ball's centre below which a direction is undefined [ball radii]
 
 
 @wp.struct
 class BodyMotion:
-    """Where the bodies of each scene are, and how they move."""
+    """Poses and motion of the bodies of each scene."""
 
-    com: wp.array2d[wp.vec3]
-    quat: wp.array2d[wp.vec4]
-    R: wp.array2d[wp.mat33]
-    velocity: wp.array2d[wp.vec3]
-    momentum: wp.array2d[wp.vec3]  # angular, per unit of mass
-    spin: wp.array2d[wp.vec3]
-    low: wp.array2d[wp.vec3]  # the room of each body
-    high: wp.array2d[wp.vec3]
-    margin: wp.array2d[float]  # gap up to which contacts are looked for [m]
+    com: wp.array2d[wp.vec3]  # centre of mass [m]
+    quat: wp.array2d[wp.vec4]  # orientation w x y z
+    R: wp.array2d[wp.mat33]  # rotation matrix of `quat`
+    velocity: wp.array2d[wp.vec3]  # of the centre of mass [m/s]
+    momentum: wp.array2d[wp.vec3]  # angular momentum per unit of mass [m^2/s]
+    spin: wp.array2d[wp.vec3]  # angular velocity [rad/s]
+    low: wp.array2d[wp.vec3]  # low corner of the room that each body moves in [m]
+    high: wp.array2d[wp.vec3]  # high corner of this room [m]
+    margin: wp.array2d[float]  # each body's part of the gap up to which contacts are detected [m]
     pinned: wp.array2d[wp.bool]
-    step: float  # [s]
+    step: float  # time step [s]
 
 
 @wp.struct
@@ -49,16 +50,16 @@ class NearPoint:
     """A point of body a near body b or near a plane."""
 
     a: int
-    b: int  # a at a plane
-    at: wp.vec3  # of a [m]
-    gap: float  # [m]
-    normal: wp.vec3  # of b, towards a
+    b: int  # equal to a for a plane
+    at: wp.vec3  # position on a, world axes [m]
+    gap: float  # signed distance, negative for penetration [m]
+    normal: wp.vec3  # contact normal, from b towards a
     facing: bool  # whether both surfaces face each other
 
 
 @wp.func
 def _inward(side: int) -> wp.vec3:
-    """Normal of a plane of the room."""
+    """Inward normal of a plane of the room."""
     out = wp.vec3()
     out[side % 3] = wp.where(side < 3, 1.0, -1.0)
     return out
@@ -66,7 +67,7 @@ def _inward(side: int) -> wp.vec3:
 
 @wp.func
 def plane_gap(motion: BodyMotion, scene: int, a: int, side: int, x: wp.vec3) -> float:
-    """Distance of x from a plane of the room of body a [m]."""
+    """Signed distance of x from a plane of the room of body a [m]."""
     axis = side % 3
     if side < 3:
         return x[axis] - motion.low[scene, a][axis]
@@ -75,13 +76,13 @@ def plane_gap(motion: BodyMotion, scene: int, a: int, side: int, x: wp.vec3) -> 
 
 @wp.func
 def in_body_frame(motion: BodyMotion, scene: int, body: int, x: wp.vec3) -> wp.vec3:
-    """The place x in the frame of a body [m]."""
+    """Transform a point x [m] from the world to the frame of a body."""
     return wp.transpose(motion.R[scene, body]) * (x - motion.com[scene, body])
 
 
 @wp.func
 def _way_of_a_step(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -> wp.vec3:
-    """The way of body a at x in a step, in the frame of body b and relative to it [m]."""
+    """Displacement, in one step, of the point of body a at x relative to body b, in the frame of b [m]."""
     velocity = motion.velocity[scene, a] + wp.cross(motion.spin[scene, a], x - motion.com[scene, a])
     velocity -= motion.velocity[scene, b] + wp.cross(motion.spin[scene, b], x - motion.com[scene, b])
     return motion.step * (wp.transpose(motion.R[scene, b]) * velocity)
@@ -91,10 +92,11 @@ def _way_of_a_step(motion: BodyMotion, scene: int, a: int, b: int, x: wp.vec3) -
 def _ends_at_face(
     s: SurfaceArrays, motion: BodyMotion, scene: int, point: NearPoint, own: wp.vec3, depth: float, face: wp.vec3
 ) -> bool:
-    """Whether an edge of body a touches a face of b, and not the other way round, near a point at this depth in b.
+    """Whether a contact point is an edge of body a on a face of body b, rather than the reverse.
 
-    `own` is the normal of a's face there, and `face` that of b's in its frame: b's goes on below the point, and a's
-    does not beyond the line in which both meet.
+    `depth` is the depth of `point` in b [m], `own` the normal of a's face in world axes, `face` the normal of b's face
+    in the frame of b. True if the face of b continues below the point, and the face of a ends at the line where the
+    planes of both faces intersect.
     """
     normal = motion.R[scene, point.b] * face
     below = point.at + (depth - s.spacing[point.b]) * normal
@@ -109,8 +111,10 @@ def _ends_at_face(
 
 @wp.func
 def _turned(s: SurfaceArrays, a: int, q: int, direction: wp.vec3) -> wp.vec4:
-    """Sample q of body a in its frame, and whether it is moved: around the axis of a cylinder as far in a direction as
-    its circle goes, since cylinders touch along a line and not where there is a sample.
+    """Sample q of body a in its frame, rotated about the axis of a cylinder; the fourth component is 1 if it was.
+
+    A sample on the lateral surface is moved to the extreme point of its circle in `direction` (frame of a), since
+    cylinders touch along a line that need not contain a sample.
     """
     x = s.samples[a, q]
     out = wp.vec4(x[0], x[1], x[2], 0.0)
@@ -129,15 +133,16 @@ def _turned(s: SurfaceArrays, a: int, q: int, direction: wp.vec3) -> wp.vec4:
 
 @wp.func
 def sample_at_plane(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, side: int, q: int) -> wp.vec3:
-    """Where sample q of body a would touch a plane of its room."""
+    """World position of sample q of body a for contact with a plane of its room; see `_turned`."""
     x = _turned(s, a, q, -(wp.transpose(motion.R[scene, a]) * _inward(side)))
     return motion.com[scene, a] + motion.R[scene, a] * wp.vec3(x[0], x[1], x[2])
 
 
 @wp.func
 def _at_side(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
-    """Direction out of the side of a cylinder b at x in its frame, and the distance from it [m]; the distance is
-    infinite where an end is nearer, or b is no cylinder.
+    """Outward direction and signed distance [m] of the lateral surface of a cylinder b at x in its frame.
+
+    The distance is NO_CONTACT where an end face is closer, or b is not a cylinder.
     """
     out = wp.vec4(0.0, 0.0, 0.0, NO_CONTACT)
     if s.side[b] > 0.0:
@@ -152,7 +157,10 @@ def _at_side(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def _at_surface(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
-    """Direction out of body b at x in its frame, that of a face if there is one, and the distance from it [m]."""
+    """Outward direction and signed distance [m] of body b at x in its frame.
+
+    The direction is the normal of a nearby face if one is nearly parallel to the gradient.
+    """
     out = _at_side(s, b, x)
     if out[3] == NO_CONTACT:
         found = depth_at(s, b, x)
@@ -171,7 +179,10 @@ def _at_surface(s: SurfaceArrays, b: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def _side_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
-    """Sample q of a cylinder a, moved around its axis, at body b; the gap is infinite where it is not moved."""
+    """Contact of sample q of a cylinder a, rotated about its axis, with body b.
+
+    The gap is NO_CONTACT if the sample cannot be rotated; see `_turned`.
+    """
     out = NearPoint()
     out.a = a
     out.b = b
@@ -179,11 +190,13 @@ def _side_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int,
     out.facing = True
     R = motion.R[scene, b]
     at = s.samples[a, q]
-    if s.side[b] > 0.0:  # what faces the other axis is nearest to it
+    if s.side[b] > 0.0:  # of two cylinders, the sides that face each other's axis are closest: start on the axis of a
         at = s.centre[a] + wp.dot(at - s.centre[a], s.axis[a]) * s.axis[a]
     is_moved = bool(True)
     i = int(0)
-    while i < 3:  # faces are only known near a surface; not a range, which would be unrolled
+    # Iterate: each lookup gives the direction for the next rotation, since faces are only known near a surface. A while
+    # loop, because Warp would unroll a range.
+    while i < 3:
         place = motion.com[scene, a] + motion.R[scene, a] * at
         found = _at_surface(s, b, in_body_frame(motion, scene, b, place))
         normal = R * wp.vec3(found[0], found[1], found[2])
@@ -201,7 +214,7 @@ def _side_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int,
 
 @wp.func
 def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, q: int) -> NearPoint:
-    """Sample q of body a at body b."""
+    """Contact of sample q of body a with body b."""
     if s.side[a] > 0.0:
         moved = _side_near(s, motion, scene, a, b, q)
         if moved.gap < NO_CONTACT:
@@ -213,7 +226,8 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
     out.at = motion.com[scene, a] + motion.R[scene, a] * s.samples[a, q]
     x = in_body_frame(motion, scene, b, out.at)
     is_flat = s.flatness[s.point[a, q]] > 1.0 - CURVED and s.side[a] == 0.0
-    if is_flat and s.side[b] > 0.0 and s.reach[a] > SMALL * s.reach[b]:  # samples of the cylinder touch the face
+    # A flat face of a on a cylinder b is in contact through the samples of the cylinder.
+    if is_flat and s.side[b] > 0.0 and s.reach[a] > SMALL * s.reach[b]:
         out.gap = NO_CONTACT
         return out
     found = depth_at(s, b, x)
@@ -225,17 +239,19 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
             share = first_inside(s, b, x, way, -s.overlap[a, b])
             way *= share
         later = depth_at(s, b, x + way)
-        if share < 1.0:  # it meets a wall, which it may have passed at the end
+        if share < 1.0:  # the sample hits a wall, which it may have passed through at the end of the step
             x += way
-        if share < 1.0 or later[3] < 0.0:  # else it stays outside, and may pass an edge whose normal would stop it
+        # later[3] < 0: the sample is outside at the end of the step, so it may pass an edge whose normal would stop it
+        if share < 1.0 or later[3] < 0.0:
             later[3] = later[3] - wp.dot(wp.vec3(later[0], later[1], later[2]), way)
             found = later
     out.normal = -(R * wp.vec3(found[0], found[1], found[2]))
     out.gap = s.overlap[a, b] - found[3]
     own = motion.R[scene, a] * s.normals[a, q]
     out.facing = -wp.dot(own, out.normal) > MIN_FACING
-    # Where b has an edge its depths increase in an oblique direction. The normal is that of a face: of faces that are
-    # parallel the one of the flatter surface, else that of a if its sample is on one, unless that ends at a face of b.
+    # Near an edge of b the gradient of its depth is oblique, so the normal is taken from a face: if a face of a and one
+    # of b are parallel, the face of the flatter surface; else the face of a's sample if it is on one, unless this face
+    # ends at a face of b, which is then used.
     p = s.point[a, q]
     r = s.nearest[nearest_node(s, b, x)]
     most = float(-1.0)
@@ -265,7 +281,7 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
 
 @wp.func
 def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> NearPoint:
-    """The point of a ball a that is nearest to body b."""
+    """Contact at the point of a ball a that is closest to body b."""
     out = NearPoint()
     out.a = a
     out.b = b
@@ -277,7 +293,7 @@ def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) 
         on = closest_point(s, b, in_body_frame(motion, scene, b, centre))
         outward = centre - (motion.com[scene, b] + motion.R[scene, b] * on.at)
         normal = motion.R[scene, b] * on.normal
-        side = wp.where(wp.dot(outward, normal) < 0.0, -1.0, 1.0)  # the centre may be inside
+        side = wp.where(wp.dot(outward, normal) < 0.0, -1.0, 1.0)  # the centre of the ball may be inside b
         out.gap = side * wp.length(outward) - s.radius[a]
         out.normal = wp.where(wp.length(outward) > NO_DISTANCE * s.radius[a], side * wp.normalize(outward), normal)
     out.at = centre - s.radius[a] * out.normal
@@ -288,8 +304,10 @@ def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) 
 
 @wp.func
 def ball_ahead(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> NearPoint:
-    """The point of a ball a that meets body b in a step, where that is not convex: the nearest point may be of another
-    side. The gap is infinite where it meets none, or moves by less than its radius.
+    """Contact at the point where a ball a hits a non-convex body b during the step.
+
+    The closest point at the start (`ball_near`) may be on another side of b. The gap is NO_CONTACT if b is convex, the
+    ball does not hit it, or the ball moves by less than its radius.
     """
     out = NearPoint()
     out.a = a
@@ -315,7 +333,7 @@ def ball_ahead(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int)
 
 @wp.func
 def plane_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, side: int, q: int) -> NearPoint:
-    """Sample q of body a, or the point of a ball, at a plane."""
+    """Contact of sample q of body a, or of the closest point of a ball, with a plane of its room."""
     out = NearPoint()
     out.a = a
     out.b = a

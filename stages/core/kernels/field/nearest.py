@@ -1,4 +1,4 @@
-"""Nearest points between objects by brute force within bounding boxes.
+"""Nearest points between objects, by brute force within bounding boxes.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -11,7 +11,7 @@ from torch import Tensor
 from stages.core.kernels.operators import operator
 
 BLOCK = tl.constexpr(16)  # query points per program
-CHUNK = tl.constexpr(128)  # points that it reads at a time
+CHUNK = tl.constexpr(128)  # points of the other object per iteration
 
 
 @triton.jit
@@ -64,10 +64,11 @@ def _nearest(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[
 
 
 def nearest_between_objects(points: Tensor, valid: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Distance [m] from point n of object i to the nearest point of every object j, and that point's index.
+    """Return the distance [m] from each point of object i to the nearest point of object j, and that point's index.
 
-    `points` (b o n 3) in single precision [m], `valid` (b o n); both results (b o o n). The distance is infinite where
-    it is not below `radius` [m], to the own object, and to and from padding; the index is then undefined.
+    `points` (b o n 3) are in single precision [m]; `valid` (b o n) is false for padding. Both results are (b o o n).
+    The distance is infinite, and the index undefined, where it is not below `radius` [m], for j = i, and to or from
+    padding.
     """
     hidden = ~valid[..., None]
     placed = points.masked_fill(hidden, torch.inf)  # infinitely far from everything

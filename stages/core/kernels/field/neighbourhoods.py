@@ -13,12 +13,12 @@ from stages.core.kernels.field.vec3 import dot, load3, sub
 ROWS, CHUNK = (
     tl.constexpr(8),
     tl.constexpr(256),
-)  # rows of the matrix per program, and columns that it computes at a time
+)  # rows of the matrix per program, and columns per iteration
 
 
 @triton.jit
 def _weights(arm, mass_fraction, x, slope, s, n):
-    """Weights of points s for points x, before normalisation."""
+    """Weights of points s for points x before normalisation."""
     y = load3(arm + 3 * s, 1, s < n)
     d = sub((x[0][:, None], x[1][:, None], x[2][:, None]), (y[0][None, :], y[1][None, :], y[2][None, :]))
     return tl.exp(slope * dot(d, d)) * tl.load(mass_fraction + s, mask=s < n, other=0.0)[None, :]
@@ -26,7 +26,7 @@ def _weights(arm, mass_fraction, x, slope, s, n):
 
 @triton.jit
 def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n):
-    """Rows of the weight matrix of one object and radius, in two passes: their sums, then the normalised weights."""
+    """Compute rows of the weight matrix of one object and radius in two passes: row sums, then normalised weights."""
     i = tl.program_id(0)
     table = i * tl.num_programs(1) + tl.program_id(1)
     arm, mass_fraction, valid = arm + 3 * i * n, mass_fraction + i * n, valid + i * n
@@ -48,9 +48,10 @@ def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n):
 
 
 def neighbourhood_weights(arm: Tensor, valid: Tensor, mass_fraction: Tensor, radii: Tensor) -> Tensor:
-    """Gaussian weights exp(-(d / radius)^2) x mass fraction between points, with rows that sum to 1: (b o s n n).
+    """Return Gaussian weights exp(-(d / radius)^2) x mass fraction between points: (b o s n n), rows sum to 1.
 
-    `arm` (b o n 3): points [m]; `valid` (b o n): rows are 0 where false; `mass_fraction` (b o n); `radii` (b o s) [m].
+    `arm` (b o n 3) are the points [m]; rows where `valid` (b o n) is false are 0; `mass_fraction` is (b o n), `radii`
+    (b o s) [m].
     """
     b, o, n, _ = arm.shape
     inputs = [x.contiguous() for x in (arm, valid, mass_fraction, radii)]

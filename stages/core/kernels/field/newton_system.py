@@ -1,6 +1,6 @@
-"""The linear equations of a step of Newton's method for contacts: assembled from the contacts, and solved.
+"""Linear system of a Newton step of the contact solver: assembly from the contacts, LDL' decomposition and solution.
 
-Bodies that touch are near each other in the Hessian, which is zero outside a band, and is decomposed in place.
+Bodies are ordered so that touching ones are close together, which makes the Hessian banded. It is decomposed in place.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ return sum;
 
 @wp.func
 def _evaluate(s: ContactSolver, scene: int, i: int):
-    """The terms of a contact, with G its Hessian, J its impulse and K the cross products with its arms:
-    G, K_a G, K_b G, K_a G K_a', K_a G K_b', K_b G K_b', and J, K_a J, K_b J.
+    """Evaluate the terms of contact i: G, K_a G, K_b G, K_a G K_a', K_a G K_b', K_b G K_b', and J, K_a J, K_b J.
+
+    G is the contact's Hessian, J its impulse, and K_a, K_b are the cross-product matrices of its arms.
     """
     relative = relative_velocity(s.contacts, s.velocities, scene, i)
     G = contact_hessian(s.contacts, scene, i, relative, s.memory.bound[scene, i])
@@ -72,7 +73,7 @@ def _evaluate(s: ContactSolver, scene: int, i: int):
 
 @wp.func
 def _sum_pair(s: ContactSolver, scene: int, pair: int, term: int):
-    """The sum of one of the matrices, or of the vectors after them, over the contacts of a pair."""
+    """Sum one of the six matrix terms (0..5) or three vector terms (6..8) over the contacts of a pair."""
     if term < 6:
         matrix = wp.mat33d()
         for i in range(s.contacts.first[scene, pair], s.contacts.first[scene, pair + 1]):
@@ -87,17 +88,17 @@ def _sum_pair(s: ContactSolver, scene: int, pair: int, term: int):
 
 @wp.struct
 class HessianBlock:
-    """The rows of one body and the columns of another one, or of the same."""
+    """6 x 6 block of the Hessian: rows of one body, columns of another or the same body; first linear, then angular."""
 
-    top: wp.mat33d  # of velocities
-    right: wp.mat33d
-    left: wp.mat33d
-    bottom: wp.mat33d  # of spins
+    top: wp.mat33d  # linear rows, linear columns
+    right: wp.mat33d  # linear rows, angular columns
+    left: wp.mat33d  # angular rows, linear columns
+    bottom: wp.mat33d  # angular rows, angular columns
 
 
 @wp.func
 def _write_block(memory: SolverMemory, scene: int, i: int, j: int, block: HessianBlock):
-    """Write the block of ranks i and j to the Hessian."""
+    """Write the block of the bodies of ranks i and j to the Hessian."""
     n = 6 * memory.rank.shape[1]
     for r in range(3):
         for k in range(3):
@@ -109,7 +110,7 @@ def _write_block(memory: SolverMemory, scene: int, i: int, j: int, block: Hessia
 
 @wp.func
 def _assemble_own(s: ContactSolver, scene: int, i: int):
-    """The block of body i with itself, and its negative gradient."""
+    """Assemble the diagonal block of body i, and its part of the negative gradient."""
     bodies = s.memory.rank.shape[1]
     n = 6 * bodies
     eye = wp.identity(3, dtype=f64)
@@ -149,7 +150,7 @@ def _assemble_own(s: ContactSolver, scene: int, i: int):
 
 @wp.func
 def _assemble_pair(s: ContactSolver, scene: int, i: int, j: int):
-    """The block of body i with a body j of lower rank."""
+    """Assemble the block of body i and a body j of lower rank."""
     bodies = s.memory.rank.shape[1]
     block = HessianBlock()
     if not (s.inertia.pinned[scene, i] or s.inertia.pinned[scene, j]):
@@ -170,7 +171,7 @@ def _assemble_pair(s: ContactSolver, scene: int, i: int, j: int):
 
 @wp.func
 def assemble(s: ContactSolver, thread: GroupThread):
-    """Write the Hessian and the negative gradient at the present velocities."""
+    """Assemble the Hessian and the negative gradient at the current velocities."""
     scene = thread.scene
     bodies = s.memory.rank.shape[1]
     for i in range(thread.lane, contact_count(s.contacts, scene), thread.lanes):
@@ -181,7 +182,7 @@ def assemble(s: ContactSolver, thread: GroupThread):
     wait_for_group()
     for i in range(thread.lane, bodies, thread.lanes):
         _assemble_own(s, scene, i)
-    for i in range(thread.lane, bodies, thread.lanes):  # ranks
+    for i in range(thread.lane, bodies, thread.lanes):  # i and j are ranks here
         for j in range(s.memory.first_rank[scene, i], i):
             _assemble_pair(s, scene, s.memory.order[scene, i], s.memory.order[scene, j])
     wait_for_group()
@@ -193,7 +194,10 @@ def _weighted_product(d: Decomposition, scene: int, i: int, j: int, start: int, 
 
 @wp.func
 def factorise(memory: SolverMemory, thread: GroupThread):
-    """LDL' of the Hessian in place, each row from the first rank it is coupled to; the last row is solved with L."""
+    """Decompose the Hessian into LDL' in place, and solve the last row (the negative gradient) with L.
+
+    Each row starts at the first rank that its body is coupled to.
+    """
     d = memory.decomposition
     scene = thread.scene
     n = 6 * memory.rank.shape[1]
@@ -218,7 +222,7 @@ def factorise(memory: SolverMemory, thread: GroupThread):
 
 @wp.func
 def back_substitute(memory: SolverMemory, thread: GroupThread):
-    """The step of Newton's method from the decomposition."""
+    """Compute the Newton step from the decomposition."""
     d = memory.decomposition
     scene = thread.scene
     bodies = memory.rank.shape[1]
@@ -251,9 +255,7 @@ def _coupled(s: ContactSolver, scene: int, i: int, j: int) -> bool:
 
 @wp.func
 def sort_bodies(s: ContactSolver, scene: int):
-    """Order the bodies by breadth-first search, island by island (Cuthill and McKee 1969): the Hessian is then zero
-    outside a band.
-    """
+    """Order the bodies by breadth-first search, island by island (Cuthill and McKee 1969), for a banded Hessian."""
     bodies = s.memory.rank.shape[1]
     for i in range(bodies):
         s.memory.rank[scene, i] = -1

@@ -1,7 +1,7 @@
-"""Surface normals of point clouds and inverses of inertia tensors: eigenproblems of many 3 x 3 matrices in Warp.
+"""Surface normals of point clouds and inverses of inertia tensors, from the eigenvectors of many 3 x 3 matrices.
 
-Batched eigensolvers of libraries synchronise with the host; these kernels do not. Distances have the precision of the
-points, everything else is in double precision.
+Unlike the batched eigensolvers of libraries, these Warp kernels do not synchronise with the host. Distances have the
+precision of the points; everything else is in double precision.
 """
 
 from typing import Any
@@ -12,20 +12,20 @@ from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
 
-NORMAL_NEIGHBOURS = wp.constant(12)  # points in the fit of a normal, including the point itself
+NORMAL_NEIGHBOURS = wp.constant(12)  # points to which a normal is fitted, including the point itself
 SPACING_NEIGHBOURS = wp.constant(5)  # points in the mean spacing, including the point itself
-JACOBI_SWEEPS = 6  # Jacobi sweeps; convergence is quadratic
-THREADS_PER_BLOCK = 64  # on a GPU; ten blocks fit on a multiprocessor
+JACOBI_SWEEPS = 6  # number of Jacobi sweeps; convergence is quadratic
+THREADS_PER_BLOCK = 64  # threads per block on a GPU; ten blocks fit on a multiprocessor
 
 Indices = wp.types.vector(length=NORMAL_NEIGHBOURS, dtype=wp.int32)
 
 
 @wp.func
 def _jacobi_rotation(A: wp.mat33d, V: wp.mat33d, p: int, q: int):
-    """A and V after the rotation in the plane of axes p and q that zeroes A[p, q]."""
+    """Return A and V after the rotation in the plane of axes p and q that zeroes A[p, q]."""
     G = wp.identity(n=3, dtype=wp.float64)
     if A[p, q] != wp.float64(0.0):
-        cot = (A[q, q] - A[p, p]) / (wp.float64(2.0) * A[p, q])  # of twice the angle
+        cot = (A[q, q] - A[p, p]) / (wp.float64(2.0) * A[p, q])  # cotangent of twice the rotation angle
         tan = wp.float64(1.0) / (wp.abs(cot) + wp.sqrt(cot * cot + wp.float64(1.0)))
         if cot < wp.float64(0.0):
             tan = -tan
@@ -90,15 +90,15 @@ def _normals(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
     spacing[o, i] = total / wp.max(neighbours, wp.float64(1.0))
 
 
-for _vector in (wp.vec3, wp.vec3d):  # both at once: a later overload would recompile the module
+for _vector in (wp.vec3, wp.vec3d):  # declare both now: adding an overload later would recompile the module
     wp.overload(_normals, {"points": wp.array2d(dtype=_vector)})
 
 
 def normals_and_spacing(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Surface normals (b o n 3) and spacing (b o n) [m] at points (b o n 3) [m]; both 0 where not `valid` (b o n).
+    """Return surface normals (b o n 3) and spacings (b o n) [m] at points (b o n 3) [m]; 0 where not `valid` (b o n).
 
-    A normal is the direction of least extent of the NORMAL_NEIGHBOURS nearest points, of arbitrary sign; the spacing
-    is the mean distance to the SPACING_NEIGHBOURS - 1 nearest others.
+    A normal is the direction of least extent of the NORMAL_NEIGHBOURS nearest points, with arbitrary sign. The spacing
+    is the mean distance to the SPACING_NEIGHBOURS - 1 nearest other points.
     """
     normal = torch.zeros_like(points, dtype=torch.float64, memory_format=torch.contiguous_format)
     spacing = normal.new_zeros(valid.shape)
@@ -136,7 +136,10 @@ def _invert_spd(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.m
 
 
 def invert_spd(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses of symmetric positive definite matrices (b o 3 3), and the inverses' eigenvalues, ascending (b o 3)."""
+    """Return inverses (b o 3 3) of symmetric positive definite matrices, and the inverses' eigenvalues (b o 3) sorted.
+
+    The eigenvalues are in ascending order.
+    """
     real = matrix.double().contiguous()
     inverse, values = torch.empty_like(real), torch.empty_like(real[..., 0])
     inputs = [view(real.flatten(0, 1), wp.mat33d), JACOBI_SWEEPS]

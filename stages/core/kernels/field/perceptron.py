@@ -1,4 +1,4 @@
-"""Small multilayer perceptron over dot products of vectors, fused into one launch: only its output is written.
+"""Small multilayer perceptron on dot products of vectors, fused into one launch that writes only its output.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -14,34 +14,34 @@ from torch.nn.functional import linear, silu
 
 from stages.core.kernels.operators import operator
 
-MAX_LAYER_WIDTH = 128  # hidden and output layers: their weights and a block of rows are kept on chip
-CHUNK = 64  # input columns read at a time
-SMALL_BLOCK_ROWS = 65_536  # up to so many rows use smaller blocks, to occupy all multiprocessors
+MAX_LAYER_WIDTH = 128  # of hidden and output layers, whose weights are kept on chip with a block of rows
+CHUNK = 64  # input columns per iteration
+SMALL_BLOCK_ROWS = 65_536  # up to this number of rows, blocks are smaller so that all multiprocessors are occupied
 
 
 class _Rows(NamedTuple):
-    """Inputs of the rows, see `perceptron`; each may be None but x."""
+    """Inputs of the rows, see `perceptron`; all tensors except x may be None."""
 
     x: Tensor
     vectors: Tensor | None
     offset: Tensor | None
     needed: Tensor | None
     count: int
-    each: int  # rows of a group
+    each: int  # rows per group
 
 
 class _Widths(NamedTuple):
-    """Numbers of vectors and columns of the input and of each layer's output; the latter padded to powers of two."""
+    """Sizes of the input and of each layer's output, and the latter padded to powers of two."""
 
-    VECTORS: int
-    COLUMNS: int
-    HIDDEN: int
-    MIDDLE: int  # of the second of three layers
-    OUTER: int
-    K: int  # input columns read at a time
-    H: int
-    M: int
-    O: int
+    VECTORS: int  # vectors of the input
+    COLUMNS: int  # scalar columns of the input
+    HIDDEN: int  # output of the first layer
+    MIDDLE: int  # output of the second of three layers
+    OUTER: int  # output of the last layer
+    K: int  # input columns per iteration
+    H: int  # HIDDEN, padded
+    M: int  # MIDDLE, padded
+    O: int  # OUTER, padded
 
 
 @triton.jit
@@ -54,7 +54,7 @@ def _component(vectors, r, there, i, VECTORS: tl.constexpr):
 
 @triton.jit
 def _layer(h, layer, INNER: tl.constexpr, OUTER: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
-    """SiLU, then a linear layer from INNER columns (h has them padded) to OUTER, padded to O."""
+    """SiLU, then a linear layer from INNER columns (padded in h) to OUTER columns padded to O."""
     weight, bias = layer
     i, o = tl.arange(0, h.shape[1]), tl.arange(0, O)
     h = h * tl.sigmoid(h)
@@ -65,7 +65,7 @@ def _layer(h, layer, INNER: tl.constexpr, OUTER: tl.constexpr, O: tl.constexpr, 
 
 @triton.jit
 def _first_layer(rows, r, in_range, layer, ACTIVE: tl.constexpr, D: tl.constexpr, PRECISION: tl.constexpr):
-    """First layer of a block of rows r; ACTIVE: after SiLU. D: the _Widths."""
+    """First layer of a block of rows r, after SiLU if ACTIVE; D is the _Widths."""
     weight, bias = layer
     PRODUCTS: tl.constexpr = D.VECTORS * (D.VECTORS + 1) // 2
     INNER: tl.constexpr = PRODUCTS + D.COLUMNS
@@ -103,7 +103,7 @@ def _first_layer(rows, r, in_range, layer, ACTIVE: tl.constexpr, D: tl.constexpr
 
 @triton.jit
 def _perceptron(rows, layers, out, ACTIVE: tl.constexpr, D: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr):
-    """Rows BLOCK at a time; `layers` (weight, bias) are the first, the second of three or None, and the last."""
+    """Apply the layers to BLOCK rows; `layers` (weight, bias) are the first, the second of three or None, the last."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     in_range = r < rows.count
     O: tl.constexpr = D.O
@@ -155,10 +155,10 @@ def perceptron(
 ) -> Tensor:  # fmt: skip
     """Apply two or three linear layers with SiLU between them, in single precision, without gradients.
 
-    The input of the first layer is the asinh of all dot products of `vectors` (r, v, 3), then the columns of `x`
-    (r, i). Rows come in g groups of equal size; the group's row of `offset` (g, _) is added to the first layer's output
-    or, if `active`, to `x`, which is then activated as well. `needed` (r) masks the rows whose result is used: others
-    may be 0. With torch.set_float32_matmul_precision("high") products are rounded to TF32.
+    The input of the first layer is the asinh of all dot products of `vectors` (r, v, 3), followed by the columns of `x`
+    (r, i). Rows form g groups of equal size; the group's row of `offset` (g, _) is added to the first layer's output
+    or, if `active`, to `x`, to which SiLU is then applied as well. `needed` (r) masks the rows whose result is used;
+    the others may be 0. With torch.set_float32_matmul_precision("high") products are rounded to TF32.
     """
     x, vectors, offset, needed = (t if t is None else t.contiguous() for t in (x, vectors, offset, needed))
     return _fused(x, vectors, offset, needed, active, list(weights), list(biases))

@@ -1,6 +1,6 @@
-"""Rigid motion with solved contacts: one launch for all substeps of a frame, a group of threads for each scene.
+"""Rigid motion with solved contacts: one launch for all substeps of a frame, with a group of threads per scene.
 
-On a GPU a group is a block of threads; on the CPU it is one thread, so that scenes are simulated one after the other.
+On a GPU a group is a thread block; on the CPU it is one thread, so scenes are simulated one after the other.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from stages.core.kernels.field.rigid_motion import matrix, rotated, spin_of
 from stages.core.kernels.interop import device_of, empty_arrays, launch, with_arrays
 
 f64 = wp.float64
-GROUP = 128  # threads of a scene on a GPU
-CONTACTS_PER_BODY = 512  # room for contacts; more are left out
-RECOVERY = wp.constant(0.2)  # share of an overlap that is removed in a step (Baumgarte 1972)
-MAX_RECOVERY_SPEED = wp.constant(0.3)  # [m/s], about the speed below which bodies do not rebound
-REBOUND_SPEED = wp.constant(0.2)  # least speed of approach that rebounds [m/s]: of a fall of a hundredth of an object
-ROUGHNESS = wp.constant(0.005)  # gap up to which points take part in an impact, as surfaces are known to [m]
+GROUP = 128  # threads per scene on a GPU
+CONTACTS_PER_BODY = 512  # contacts per body for which memory is allocated; further contacts are dropped
+RECOVERY = wp.constant(0.2)  # fraction of a penetration that is removed in one substep (Baumgarte 1972)
+MAX_RECOVERY_SPEED = wp.constant(0.3)  # [m/s] limit of the speed at which penetration is removed; near REBOUND_SPEED
+REBOUND_SPEED = wp.constant(0.2)  # smallest approach speed that rebounds [m/s]: a fall of a hundredth of an object
+ROUGHNESS = wp.constant(0.005)  # gap up to which points take part in an impact [m]: the accuracy of the surfaces
 HALF_PI = wp.constant(math.pi / 2)
 
 
@@ -56,7 +56,7 @@ def _double_matrix(x: wp.mat33) -> wp.mat33d:
 
 @wp.func
 def _drifted(m: BodyMotion, bodies: BodyProperties, scene: int, i: int, h: float):
-    """Free motion of a body for h [s]."""
+    """Advance a body by free motion for h [s]."""
     quat = m.quat[scene, i]
     L = m.momentum[scene, i]
     inverse = bodies.inverse[scene, i]
@@ -68,7 +68,7 @@ def _drifted(m: BodyMotion, bodies: BodyProperties, scene: int, i: int, h: float
 
 @wp.func
 def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver, scene: int, i: int):
-    """The first half of a substep for body i, and its velocities without contact."""
+    """First half of a substep for body i: half a drift step, and the velocities that it would get without contact."""
     h = world.motion.step
     _drifted(world.motion, bodies, scene, i, h / 2.0)
     R = matrix(world.motion.quat[scene, i])
@@ -101,7 +101,7 @@ def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver,
 
 @wp.func
 def _add_contact(bodies: BodyProperties, m: BodyMotion, solver: ContactSolver, near: NearPoint, scene: int, i: int):
-    """Write the contact at a point as contact i."""
+    """Write the contact at point `near` as contact i of a scene."""
     h = m.step
     a = near.a
     b = near.b
@@ -138,7 +138,7 @@ def _add_contact(bodies: BodyProperties, m: BodyMotion, solver: ContactSolver, n
 
 @wp.func
 def _end(bodies: BodyProperties, m: BodyMotion, v: Velocities, scene: int, i: int):
-    """The second half of a substep."""
+    """Second half of a substep for body i: set its velocities to the solution, and drift."""
     velocity = single(v.linear[scene, i])
     R = m.R[scene, i]
     momentum = R * (bodies.inertia[scene, i] * (wp.transpose(R) * single(v.angular[scene, i])))
@@ -152,7 +152,7 @@ def _end(bodies: BodyProperties, m: BodyMotion, v: Velocities, scene: int, i: in
 
 @wp.func
 def _list_contacts(c: Contacts, found: Found, scene: int):
-    """Divide the room for contacts among the pairs."""
+    """Assign a range of contacts to each pair, and list the pairs that have contacts."""
     pairs = found.count.shape[1]
     total = int(0)
     active = int(0)
@@ -213,9 +213,9 @@ def _frames(
 
 
 class RigidFrames:
-    """The rigid motion of batches of `scenes` scenes whose bodies have these surfaces.
+    """Rigid motion of batches of `scenes` scenes whose bodies have the given surfaces.
 
-    `surfaces`: the fields of BodySurfaces.
+    `surfaces` are the fields of BodySurfaces.
     """
 
     def __init__(self, surfaces: dict[str, Tensor], scenes: int, keypoints: int):
@@ -237,11 +237,13 @@ class RigidFrames:
         self, bodies: dict[str, Tensor], box: Float[Tensor, "b o 2 3"], pinned: Bool[Tensor, "b o"],
         state: tuple[Tensor, Tensor, Tensor, Tensor], substeps: int, h: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Float[Tensor, "b o n 3"], Float[Tensor, "b o 6"]]:  # fmt: skip
-        """The state after `substeps` of h [s], the mean accelerations of the keypoints by contact [m/s^2], and the
-        mean force [N] of contacts on each body with its torque about the centre of mass [N m].
+        """Advance the state by `substeps` of h [s].
 
-        state: com (b, o, 3), quat (b, o, 4), velocity (b, o, 3) and angular momentum per unit of mass (b, o, 3).
-        bodies: the fields of BodyProperties. Accelerations are in the bodies' frames.
+        `state` is com (b, o, 3), quat (b, o, 4), velocity (b, o, 3) and angular momentum per unit of mass (b, o, 3).
+        `bodies` are the fields of BodyProperties.
+
+        Returns the new state, the mean accelerations of the keypoints by contact [m/s^2] in the bodies' frames, and the
+        mean contact force [N] on each body with its torque about the centre of mass [N m].
         """
         names = "com", "quat", "velocity", "momentum"
         new = {k: x.clone(memory_format=torch.contiguous_format) for k, x in zip(names, state, strict=True)}

@@ -1,4 +1,4 @@
-"""Free rigid-body motion, one thread per body: one launch instead of dozens of small tensor operations."""
+"""Free rigid-body motion in one launch with a thread per body, instead of dozens of small tensor operations."""
 
 import warp as wp
 from torch import Tensor
@@ -9,7 +9,7 @@ from stages.core.kernels.operators import operator
 
 @wp.func
 def matrix(quat: wp.vec4):
-    """Rotation matrix of a quaternion w x y z of any length."""
+    """Rotation matrix of a quaternion w x y z of any norm."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(quat[1], quat[2], quat[3], quat[0])))
 
 
@@ -30,7 +30,7 @@ def rotated(quat: wp.vec4, rotation: wp.vec3):
 
 @wp.struct
 class Placement:
-    """Where bodies are."""
+    """Poses of bodies."""
 
     com: wp.array[wp.vec3]  # centre of mass [m]
     quat: wp.array[wp.vec4]
@@ -75,9 +75,10 @@ def _drift_shapes(com, quat, velocity, momentum, inverse, dt):
 def drift(
     com: Tensor, quat: Tensor, velocity: Tensor, momentum: Tensor, inverse: Tensor, dt: float
 ) -> tuple[Tensor, Tensor]:
-    """Centres of mass (..., 3) and quaternions (..., 4) after free motion for dt [s]. Without gradients.
+    """Return centres of mass (..., 3) and quaternions (..., 4) after free motion for dt [s], without gradients.
 
-    `momentum` is angular, `inverse` (..., 3, 3) the inverse inertia in the body frame, both per unit of mass.
+    `momentum` is the angular momentum, `inverse` (..., 3, 3) the inverse inertia in the body frame, both per unit of
+    mass.
     Reference: `stages.core.models.field.rigid_body.drift`.
     """
     moved, turned = com.new_empty(com.shape), quat.new_empty(quat.shape)
@@ -94,7 +95,7 @@ def _pose_shapes(quat, momentum, inverse):
 
 @operator("pose", _pose_shapes)
 def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation matrices (..., 3, 3) and angular velocities (..., 3) [rad/s] of bodies. Without gradients.
+    """Return rotation matrices (..., 3, 3) and angular velocities (..., 3) [rad/s] of bodies, without gradients.
 
     Reference: `stages.core.models.field.rigid_body.pose`.
     """

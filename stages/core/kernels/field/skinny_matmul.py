@@ -1,4 +1,4 @@
-"""Skinny matrix products: large half-precision matrices times a few columns, a shape that BLAS libraries run slowly.
+"""Products of large half-precision matrices with a few columns, a shape for which BLAS libraries are slow.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -10,14 +10,16 @@ from torch import Tensor
 
 from stages.core.kernels.operators import operator
 
-ROWS, CHUNK = tl.constexpr(64), tl.constexpr(128)  # rows per program, and inner dimension read at a time
-COLUMNS = tl.constexpr(16)  # c, padded
+ROWS, CHUNK = tl.constexpr(64), tl.constexpr(128)  # rows per program, and part of the inner dimension per iteration
+COLUMNS = tl.constexpr(16)  # number of columns c, padded
 
 
 @triton.jit
 def _skinny_matmul(A, columns, out, n, k, c):
-    """Matrices (n, k) times columns (a high and a low part, each (c, k)), in half precision with single-precision sums;
-    out (c, n)."""
+    """Multiply matrices (n, k) by columns, given as a high and a low part (c, k) each; `out` is (c, n).
+
+    Inputs are in half precision, sums in single precision.
+    """
     high, low = columns
     blocks = tl.cdiv(n, ROWS)
     matrix, block = (tl.program_id(0) // blocks).to(tl.int64), tl.program_id(0) % blocks
@@ -39,7 +41,10 @@ def _split_matmul_shapes(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
 
 @operator("skinny_matmul", _split_matmul_shapes)
 def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
-    """A (g, n, k) times the columns high + low (g, c, k), all in half precision: (g, c, n) in single precision."""
+    """Return A (g, n, k) times the columns high + low (g, c, k): (g, c, n) in single precision.
+
+    All inputs are in half precision.
+    """
     g, n, k = A.shape
     out = torch.empty(g, high.shape[1], n, dtype=torch.float32, device=A.device)
     blocks = (g * triton.cdiv(n, ROWS.value),)
@@ -48,10 +53,10 @@ def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
 
 
 def skinny_matmul(A: Tensor, x: Tensor) -> Tensor:
-    """A @ x in single precision, for A (..., n, k) in half precision and x (..., k, c) with c <= COLUMNS."""
+    """Return A @ x in single precision, for A (..., n, k) in half precision and x (..., k, c) with c <= COLUMNS."""
     columns = x.flatten(0, -3).mT
     scale = columns.abs().amax(-1, keepdim=True).clamp_min(1e-30) / 1024
     columns = (columns / scale).contiguous()
-    high = columns.half()  # the sum of two half-precision numbers has 22 bits
+    high = columns.half()  # the sum of two half-precision numbers, high + low, has 22 bits
     out = split_matmul(A.flatten(0, -3).contiguous(), high, (columns - high).half()) * scale
     return out.mT.unflatten(0, A.shape[:-2])

@@ -1,4 +1,4 @@
-"""Look-ups in the surfaces of rigid bodies: depths on their grids, and closest points."""
+"""Queries of the surfaces of rigid bodies: depths interpolated on grids, closest points, and sweeps along a path."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import warp as wp
 
 f64 = wp.float64
 NO_FACE = wp.constant(-1)
-GRID_STEPS = wp.constant(6)  # from the nearest sample to the closest point of a surface on a grid
-STEP = wp.constant(2.0)  # longest of them, in nodes of the grid
-SWEEP_STEPS = wp.constant(64)  # along a way, of a node of the grid or more
-MIN_INWARD = wp.constant(0.3)  # least cosine between a way and the direction into a surface that it meets
-HULL_STEPS = wp.constant(32)  # to that of a hull; each adds a face, and about as many as three are needed
-ON_FACE = wp.constant(wp.float64(1e-6))  # distance from a face at which a point is on it, in sizes of the body
+GRID_STEPS = wp.constant(6)  # number of steps from the nearest sample to the closest point of a surface on a grid
+STEP = wp.constant(2.0)  # longest of these steps [grid spacings]
+SWEEP_STEPS = wp.constant(64)  # maximum number of steps along a path; each is at least one grid spacing long
+MIN_INWARD = wp.constant(0.3)  # smallest cosine between a path and the inward direction for the path to hit a surface
+HULL_STEPS = wp.constant(32)  # maximum iterations to the closest point of a hull; each adds a face, about three suffice
+ON_FACE = wp.constant(wp.float64(1e-6))  # distance from a face up to which a point is on it [reach of the body]
 
 
 @wp.struct
 class SurfaceArrays:
-    """BodySurfaces for kernels; its docstring has the fields."""
+    """BodySurfaces for kernels; the fields are documented there."""
 
     depth: wp.array[float]
     smooth: wp.array[float]
@@ -46,10 +46,10 @@ class SurfaceArrays:
 
 @wp.struct
 class SurfacePoint:
-    """A point of the surface of a body, in its frame."""
+    """A point on the surface of a body, in the body frame."""
 
     at: wp.vec3
-    normal: wp.vec3  # outwards
+    normal: wp.vec3  # outward
 
 
 @wp.func
@@ -60,7 +60,10 @@ def _node(s: SurfaceArrays, body: int, i: int, j: int, k: int) -> int:
 
 @wp.func
 def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
-    """Direction of steepest increase, and depth, at x in the frame of a body; see BodySurfaces.look_up."""
+    """Return the direction of steepest increase of the depth, and the depth, at x in the frame of a body.
+
+    See BodySurfaces.look_up.
+    """
     n = s.shape[body]
     h = s.spacing[body]
     place = (x - s.low[body]) / h
@@ -85,7 +88,9 @@ def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
         depth += s.depth[row] * u * v * w
         smooth = s.smooth[row]
         slope += smooth * wp.vec3(float(2 * i - 1) * v * w, float(2 * j - 1) * u * w, float(2 * k - 1) * u * v)
-    if beyond > 0.0:  # the body is in the box of its grid, so the angle at the box's nearest point is at least right
+    # The body lies within the box of its grid, so the angle at the nearest point of the box is at least a right angle,
+    # and Pythagoras gives an upper bound of the (negative) depth.
+    if beyond > 0.0:
         outside = wp.min(depth, 0.0)
         depth = -wp.sqrt(beyond + outside * outside)
     slope = slope / wp.max(wp.length(slope), 1.0e-12)
@@ -94,11 +99,11 @@ def depth_at(s: SurfaceArrays, body: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def first_inside(s: SurfaceArrays, body: int, x: wp.vec3, way: wp.vec3, outside: float) -> float:
-    """The share of the way of x in the frame of a body at which it is first less than `outside` from its surface while
-    it moves on into it; 1 if nowhere.
+    """Return the fraction of the path `way` of x at which x first comes closer than `outside` to the surface while
+    moving into it; 1 if it does not. Positions are in the frame of the body.
 
-    In steps by the distance from the surface, which is known to a node: Mirtich 1996, "Impulse-based dynamic simulation
-    of rigid body systems" (conservative advancement).
+    Advances by the distance to the surface, whose accuracy is one grid spacing. Source: conservative advancement,
+    Mirtich 1996, "Impulse-based dynamic simulation of rigid body systems".
     """
     length = wp.length(way)
     share = float(0.0)
@@ -115,7 +120,7 @@ def first_inside(s: SurfaceArrays, body: int, x: wp.vec3, way: wp.vec3, outside:
 
 @wp.func
 def beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
-    """How far x in the frame of a body is from the box of its grid, along one axis."""
+    """Largest distance along one axis of x, in the frame of a body, from the box of its grid; 0 inside."""
     low = s.low[body]
     out = float(0.0)
     for axis in range(3):
@@ -126,7 +131,7 @@ def beyond_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> float:
 
 @wp.func
 def nearest_node(s: SurfaceArrays, body: int, x: wp.vec3) -> int:
-    """The row of the node nearest to x in the frame of a body."""
+    """Row of the grid node nearest to x in the frame of a body."""
     n = s.shape[body]
     place = (x - s.low[body]) / s.spacing[body]
     i = wp.clamp(int(wp.round(place[0])), 0, n[0] - 1)
@@ -143,13 +148,13 @@ def _normal_of_face(s: SurfaceArrays, face: int) -> wp.vec3d:
 
 @wp.func
 def _beyond_face(s: SurfaceArrays, face: int, x: wp.vec3d) -> f64:
-    """How far x in the frame of a body is outside the plane of a face of its hull."""
+    """Signed distance of x, in the frame of a body, from the plane of a face of its hull; positive outside."""
     return wp.dot(_normal_of_face(s, face), x) + f64(s.hull[face][3])
 
 
 @wp.func
 def _outermost_face(s: SurfaceArrays, body: int, x: wp.vec3d) -> int:
-    """The face of the hull of a body from which x is farthest outside."""
+    """Face of a body's hull with the largest signed distance from x."""
     first = s.hull_first[body]
     out = first
     most = _beyond_face(s, first, x)
@@ -163,7 +168,7 @@ def _outermost_face(s: SurfaceArrays, body: int, x: wp.vec3d) -> int:
 
 @wp.func
 def _projected(s: SurfaceArrays, faces: wp.vec3i, x: wp.vec3d) -> wp.vec4d:
-    """The projection of x on the intersection of the planes of up to three faces, and its least multiplier [m]."""
+    """Projection of x onto the intersection of the planes of up to three faces, and its smallest multiplier [m]."""
     normals = wp.mat33d()
     beyond = wp.vec3d()
     for k in range(3):
@@ -172,7 +177,7 @@ def _projected(s: SurfaceArrays, faces: wp.vec3i, x: wp.vec3d) -> wp.vec4d:
             beyond[k] = _beyond_face(s, faces[k], x)
     gram = normals * wp.transpose(normals)
     for k in range(3):
-        gram[k, k] = f64(1.0)  # also of none
+        gram[k, k] = f64(1.0)  # set for unused faces as well, so that the matrix is regular
     multipliers = wp.inverse(gram) * beyond
     at = x - wp.transpose(normals) * multipliers
     return wp.vec4d(at[0], at[1], at[2], wp.min(multipliers))
@@ -180,10 +185,11 @@ def _projected(s: SurfaceArrays, faces: wp.vec3i, x: wp.vec3d) -> wp.vec4d:
 
 @wp.func
 def _closest_point_of_hull(s: SurfaceArrays, body: int, point: wp.vec3) -> SurfacePoint:
-    """The closest point of a convex body: it is projected on the face from which it is farthest outside, then on the
-    intersection of the planes of that and of up to two of those before, as long as others have it outside.
+    """Closest point of a convex body, by an active-set method.
 
-    Source: the basis computation of linear-type programs, Sharir and Welzl 1992, for the projection on a polyhedron.
+    Projects the point onto the face with the largest signed distance, then repeatedly onto the intersection of the
+    planes of the most violated face and of up to two previously active faces, until no face is violated.
+    Source: the basis computation of LP-type problems, Sharir and Welzl 1992, for the projection onto a polyhedron.
     """
     x = wp.vec3d(f64(point[0]), f64(point[1]), f64(point[2]))
     tolerance = ON_FACE * f64(s.reach[body])
@@ -200,7 +206,7 @@ def _closest_point_of_hull(s: SurfaceArrays, body: int, point: wp.vec3) -> Surfa
         before = active
         found = bool(False)
         for i in range(-1, 3):
-            for j in range(i + 1, 3):  # with at most two of those before: of none (i = -1) or two
+            for j in range(i + 1, 3):  # keep the active faces i and j, or only j if i is -1; either may be NO_FACE
                 trial = wp.vec3i(face, NO_FACE, before[j])
                 if i >= 0:
                     trial[1] = before[i]
@@ -225,7 +231,7 @@ def _closest_point_of_hull(s: SurfaceArrays, body: int, point: wp.vec3) -> Surfa
 
 @wp.func
 def _onto_surface(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
-    """The point of the surface near x, a few nodes of the grid away at most, and the normal there."""
+    """Point of the surface near x, which is at most a few grid spacings away, and the normal there."""
     out = SurfacePoint()
     out.at = x
     for _ in range(2):
@@ -237,9 +243,10 @@ def _onto_surface(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
 
 @wp.func
 def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
-    """The closest point: from the nearest sample in steps along the tangent plane towards x, and back to the surface.
+    """Closest point of a surface on a grid, by projected descent from the nearest sample.
 
-    A step that does not come nearer, as the surface bends away from the plane, is halved.
+    Each step moves along the tangent plane towards x and back onto the surface. If that does not reduce the distance,
+    because the surface bends away from the plane, the step length is halved.
     """
     nearest = int(0)
     least = float(1.0e18)
@@ -266,7 +273,7 @@ def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePo
 
 @wp.func
 def closest_point(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
-    """The point of the surface of a body, no ball, that is closest to x in its frame."""
+    """Closest point to x, in the frame of a body, on the surface of the body, which must not be a ball."""
     if s.hull_faces[body] > 0:
         return _closest_point_of_hull(s, body, x)
     return _closest_point_of_grid(s, body, x)

@@ -1,7 +1,7 @@
-"""3-vectors, 3 x 3 matrices and quaternions in Triton kernels, as tuples of tensors of one shape.
+"""3-vectors, 3 x 3 matrices and quaternions for Triton kernels, as tuples of tensors of equal shape.
 
-Matrices have nine entries by rows, quaternions are w x y z. `load3` and `store3` take one vector per lane, with a mask
-and a stride between components; `read` and `write` take consecutive scalars.
+Matrices have nine entries in row-major order; quaternions are w x y z. `load3` and `store3` transfer one vector per
+lane, with a mask and a stride between components; the `read` and `write` functions transfer consecutive scalars.
 """
 
 import triton
@@ -162,7 +162,7 @@ def where3(mask, a, other):
 
 @triton.jit
 def rotation_matrix(q):
-    """Rotation matrix of a quaternion of any length."""
+    """Rotation matrix of a quaternion of any norm."""
     s = 1 / tl.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     w, x, y, z = q[0] * s, q[1] * s, q[2] * s, q[3] * s
     return (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -191,6 +191,6 @@ def angular_velocity(q, momentum, inverse):
 
 @triton.jit
 def drift(com, q, velocity, momentum, inverse, dt):
-    """Centre of mass and orientation after free motion for dt [s]; the angular velocity is that of the midpoint."""
+    """Centre of mass and orientation after free motion for dt [s], with the angular velocity at the midpoint."""
     middle = rotate_quat(q, scale3(dt / 2, angular_velocity(q, momentum, inverse)))
     return add(com, scale3(dt, velocity)), rotate_quat(q, scale3(dt, angular_velocity(middle, momentum, inverse)))

@@ -1,7 +1,7 @@
-"""Velocity update and second half of the drift step: one program per object, all of its points in registers.
+"""Velocity update and second half of the drift step: one program per object, with all of its points in registers.
 
-`update_velocities` applies contact forces, gravity, external forces and friction to rigid bodies,
-`update_displacements` the internal accelerations to their displacements. Reference: `ForceField.step` in
+`update_velocities` applies contact forces, gravity, external forces and friction to rigid bodies.
+`update_displacements` applies the internal accelerations to their displacements. Reference: `ForceField.step` in
 `stages.core.models.field.force_field`. Written in Triton (see `compilers`).
 """
 
@@ -54,8 +54,9 @@ from stages.core.kernels.field.vec3 import (
 
 
 class SplitFields(NamedTuple):
-    """Contact acceleration, displacement and its rate of the keypoints in the body frame, for `split_matmul`: in units,
-    each the sum of two numbers in half precision.
+    """Contact acceleration, displacement and displacement rate of the keypoints in the body frame, for `split_matmul`.
+
+    Each value is unit x (high + low), with high and low in half precision.
     """
 
     high: Tensor  # (b o, 9, n)
@@ -64,7 +65,7 @@ class SplitFields(NamedTuple):
 
 
 class ExternalWrench(NamedTuple):
-    """External force on each object, and torque about its centre of mass."""
+    """External force on each object, and its torque about the centre of mass."""
 
     force: Tensor  # (b o 3) [N]
     torque: Tensor  # (b o 3) [N m]
@@ -80,7 +81,7 @@ def _total(parts, blocks, BLOCKS: tl.constexpr):
 
 @triton.jit
 def _contact(i, inputs, drifted, lists, wrenches):
-    """Force, torque and accelerations of the points of an object, per unit of mass, summed over its contacts."""
+    """Sum force, torque and the accelerations of the points of an object over its contacts, per unit of mass."""
     o, n = inputs.o, inputs.n
     first, index, m, kinds = i - i % o, i % o, o - 1, o + 1
     places, wide = lists.slots // ROWS, lists.wide // ROWS
@@ -113,15 +114,18 @@ def _contact(i, inputs, drifted, lists, wrenches):
 
 @triton.jit
 def _limited(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
-    """Velocity along one axis limited to [up, down], where each limit is cut at MAX_RECOVERY_SPEED [m/s]."""
+    """Limit the velocity along one axis [m/s] to the range that keeps the points within the room.
+
+    It is at least min(up, MAX_RECOVERY_SPEED) and at most max(down, -MAX_RECOVERY_SPEED).
+    """
     return tl.minimum(tl.maximum(v, tl.minimum(up, MAX_RECOVERY_SPEED)), tl.maximum(down, -MAX_RECOVERY_SPEED))
 
 
 @triton.jit
 def update_velocities(inputs, drifted, lists, messages, external, new, split, C: tl.constexpr):
-    """Update velocities by the forces, drift by dt / 2, and prepare the neighbourhood averages of the points.
+    """Update velocities by the forces, drift by dt / 2, and prepare the inputs of the neighbourhood averages.
 
-    Writes poses and motion of the bodies of the BodyState `new`, and `split`; `external` may be None.
+    Writes the poses and motion of the bodies in the BodyState `new`, and `split`; `external` may be None.
     """
     i, o, n, dt = tl.program_id(0), inputs.o, inputs.n, inputs.dt
     force, torque, acceleration = _contact(i, inputs, drifted, lists, messages.wrenches)
@@ -140,8 +144,8 @@ def update_velocities(inputs, drifted, lists, messages, external, new, split, C:
     L, spin = scale3(spin_limit, L), scale3(spin_limit, spin)
     v = scale3(C.MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), C.MAX_SPEED), v)
     extent, friction_speed = tl.load(inputs.size + i), tl.load(messages.friction + i)
-    for k in range(o - 1):  # friction of the support is passed on to what it carries
-        contact_weight = 1 - C.CONTACT_SATURATION * tl.load(messages.scale + i * (o + 1) + k)  # saturates at 1
+    for k in range(o - 1):  # the friction of a supporting object applies to the objects that it carries as well
+        contact_weight = 1 - C.CONTACT_SATURATION * tl.load(messages.scale + i * (o + 1) + k)  # approaches 1
         other_speed = tl.load(messages.friction + other_object(i, k, o))
         friction_speed = tl.maximum(friction_speed, contact_weight * other_speed)
     last = (dot(v, v) + extent * extent * dot(spin, spin)) / C.FRICTION_CUTOFF_SPEED
@@ -191,7 +195,7 @@ def update_velocities(inputs, drifted, lists, messages, external, new, split, C:
 
 @triton.jit
 def _spread(acceleration, arm, mass_fraction, size):
-    """Affine field with the virial of the contact accelerations: the symmetric virial matrix times the arms."""
+    """Affine field from the virial of the contact accelerations: the symmetric virial matrix times the arms."""
     a, b, c = scale3(mass_fraction, acceleration)
     x, y, z = sum3(scale3(a, arm)), sum3(scale3(b, arm)), sum3(scale3(c, arm))
     M = (2 * x[0], x[1] + y[0], x[2] + z[0], x[1] + y[0], 2 * y[1], y[2] + z[1], x[2] + z[0], y[2] + z[1], 2 * z[2])
@@ -200,7 +204,7 @@ def _spread(acceleration, arm, mass_fraction, size):
 
 @triton.jit
 def _split(a, to, row, n, mask):
-    """Write vectors to three rows of SplitFields, in units in which the largest component is 1,024."""
+    """Write vectors to three rows of SplitFields, in units in which the largest absolute value is 1,024."""
     largest = max3((tl.abs(a[0]), tl.abs(a[1]), tl.abs(a[2])))
     at = row * n + tl.arange(0, a[0].shape[0])
     for axis in tl.static_range(3):
@@ -214,8 +218,10 @@ def _split(a, to, row, n, mask):
 
 @triton.jit
 def update_displacements(inputs, drifted, acceleration, new, C: tl.constexpr):
-    """Update displacements and their rates (of `new`) by internal accelerations (b o, 3, n), after removing the mean
-    and the net rotation of these."""
+    """Update displacements and their rates in `new` by the internal accelerations (b o, 3, n).
+
+    The mean and the net rotation of the accelerations are removed first.
+    """
     i, n, dt = tl.program_id(0), inputs.n, inputs.dt
     r = tl.arange(0, inputs.BLOCK)
     inside = r < n

@@ -1,7 +1,7 @@
-"""The blocks of grid nodes that have particles, listed on the device and never read by the host.
+"""List of the grid blocks near particles, kept on the device and never read by the host.
 
 A particle that enters a new cell adds the blocks of its stencil. Kernels over the listed blocks are launched with a
-fixed number of threads, each of which takes several rows or nodes.
+fixed number of threads, each of which processes several rows or nodes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from stages.core.kernels.mpm.transfers import ParticleArrays, Substep
 
 @wp.struct
 class ActiveBlocks:
-    """Blocks that had particles since the start of the frame: `blocks[: total[0]]`, and a mark for every block."""
+    """Blocks that any particle's stencil has touched since the start of the frame."""
 
-    marks: wp.array[int]
-    blocks: wp.array[int]
-    total: wp.array[int]
-    sharers: wp.array[int]  # number of scenes for which a block is active
-    sweepers: int  # threads of a launch over the blocks
-    stale: wp.array[int]  # where the host lists the blocks (split.py): set when a particle moves beyond them
+    marks: wp.array[int]  # 1 for each active block, over all scenes
+    blocks: wp.array[int]  # active blocks; the first total[0] entries are used
+    total: wp.array[int]  # number of active blocks
+    sharers: wp.array[int]  # number of scenes (windows of bodies) for which each block of a grid is active
+    sweepers: int  # number of threads of a launch over the blocks
+    stale: wp.array[int]  # set when a particle leaves the blocks that the host has listed (split.py)
 
 
 @wp.func
@@ -42,7 +42,7 @@ def node_of_block(grid: MpmGrid, block: int, n: int) -> int:
 def activate_blocks(
     grid: MpmGrid, rows: ParticleArrays, i: int, base: wp.vec3i, friction: wp.array[float], active: ActiveBlocks
 ):
-    """Add the blocks of a stencil to the active ones, and update the friction coefficients of its nodes at walls."""
+    """Add the blocks of a particle's stencil to the active ones, and update the friction of its nodes at walls."""
     nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
     a0 = rows.scene[i] * nb[0]
     for a in range(base[0] // BLOCK, (base[0] + 2) // BLOCK + 1):
@@ -72,7 +72,7 @@ def _position(grid: MpmGrid, node: int) -> wp.vec3i:
 
 @wp.kernel(enable_backward=False)
 def grid_sweep(grid: MpmGrid, nodes: NodeArrays, active: ActiveBlocks, step: Substep):
-    """Momentum in fixed point, which is cleared, to velocities after walls and obstacles; a row of four nodes each."""
+    """Convert fixed-point momentum to velocities, clear it, and apply walls and obstacles; four nodes at a time."""
     t = wp.tid()
     while t < active.total[0] * BLOCK * BLOCK:
         first = node_of_block(grid, active.blocks[t // (BLOCK * BLOCK)], (t % (BLOCK * BLOCK)) * BLOCK)
@@ -85,9 +85,9 @@ def grid_sweep(grid: MpmGrid, nodes: NodeArrays, active: ActiveBlocks, step: Sub
 def contact_sweep(
     grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, active: ActiveBlocks, step: Substep
 ):
-    """Contact at the nodes of blocks that may have it; the thread of the first body in a block acts for all."""
+    """Resolve contact at the nodes of blocks that may have it; the thread of the first body in a block does it."""
     t = wp.tid()
-    blocks = grid.count // BLOCK_NODES  # of a body
+    blocks = grid.count // BLOCK_NODES  # blocks in the grid of one body
     while t < active.total[0] * BLOCK_NODES:
         block = active.blocks[t // BLOCK_NODES]
         here = block % blocks
@@ -107,7 +107,7 @@ def clear_active_blocks(
     grid: MpmGrid, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4], friction: wp.array[float],
     active: ActiveBlocks,
 ):  # fmt: skip
-    """Clear all grids and marks at the end of a frame; the caller then resets the number of active blocks."""
+    """Clear all grids and marks of active blocks at the end of a frame; the caller then resets `total`."""
     t = wp.tid()
     width = a.shape[0] // friction.shape[0]  # vec4 per node
     nodes = active.total[0] * BLOCK * BLOCK * BLOCK

@@ -1,12 +1,12 @@
 """Constitutive models: Kirchhoff stress and plastic flow (return mapping) of particles.
 
-`material_update` takes a trial deformation gradient and returns its elastic part after plastic flow, Kirchhoff stress
-and the new state variable. Kelvin-Voigt damping, eta (dv/dx + transpose), is added by the transfers for all models, and
-so are two Maxwell branches, if any particle has them: springs of `branch_modulus` times the elastic moduli, each in
-series with a damper that relaxes it at `branch_rate` [1/s]. `branch_strain` is the left Cauchy-Green tensor b of each
-spring less the identity, in which its stress is linear (Reese and Govindjee 1998, "A theory of finite viscoelasticity
-and numerical aspects", near equilibrium). The branches dissipate alike at all frequencies between their rates
-(maxwell_branches), and the substep that is stable depends on their stiffness, not on their viscosity.
+`material_update` takes a trial deformation gradient and returns its elastic part after plastic flow, the Kirchhoff
+stress and the new state variable. The transfers add Kelvin-Voigt damping, eta (dv/dx + transpose), for all models, and
+two Maxwell branches if any particle has them: springs with `branch_modulus` times the elastic moduli, each in series
+with a damper that relaxes it at `branch_rate` [1/s]. `branch_strain` is b - I, with the left Cauchy-Green tensor b of
+each spring; the stress is linear in it (Reese and Govindjee 1998, "A theory of finite viscoelasticity and numerical
+aspects", near equilibrium). The loss factor of the two branches is about the same at all frequencies between their
+rates (maxwell_branches), and the stable substep depends on their stiffness, not on their viscosity.
 
 | model       | elastic law                   | plastic (3 numbers)                                | state       |
 | NEO_HOOKEAN | mu (F F^T - I) + lambda log J | -                                                  | -           |
@@ -35,14 +35,17 @@ NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
 MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
 MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
 MAX_STIFFENING = (1.0, 1.0, 1.0, 1.0, MAX_SNOW_HARDENING)  # largest factor on the stiffness, by model
-MAX_LOSS = 0.6  # of two Maxwell branches: with .7 they are eight times as stiff as the spring that does not relax
-BRANCH_RATIO = 10.0  # of the branches' relaxation times
-RESIDUAL_STRENGTH = 0.1  # minimum yield stress after softening, as a fraction of the initial one
+MAX_LOSS = 0.6  # largest loss factor of two Maxwell branches; at .7 they are eight times as stiff as the elastic spring
+BRANCH_RATIO = 10.0  # ratio of the relaxation times of the two branches
+RESIDUAL_STRENGTH = 0.1  # minimum yield stress after softening, as a fraction of the initial yield stress
 
 
 @wp.struct
 class MaterialUpdate:
-    """F: elastic deformation gradient; tau: Kirchhoff stress [Pa]; state: see the table of the module."""
+    """Result of a material update.
+
+    F is the elastic deformation gradient, tau the Kirchhoff stress [Pa], state as in the module's table.
+    """
 
     F: wp.mat33
     tau: wp.mat33
@@ -59,9 +62,9 @@ def neo_hookean(F: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
 
 @wp.func
 def branch_update(e: wp.mat33, C: wp.mat33, rate: float, dt: float) -> wp.mat33:
-    """The strain e = b - I of a Maxwell branch after `dt` [s] of the velocity gradient `C`.
+    """Advance the strain e = b - I of a Maxwell branch by `dt` [s] at the velocity gradient `C` [1/s].
 
-    e' = C b + b C^T - rate e, with an implicit step for the relaxation, which is stable for any rate.
+    Solves e' = C b + b C^T - rate e, with an implicit step for the relaxation, which is stable for any rate.
     """
     half = C + C * e
     return (e + dt * (half + wp.transpose(half))) / (1.0 + dt * rate)
@@ -69,13 +72,13 @@ def branch_update(e: wp.mat33, C: wp.mat33, rate: float, dt: float) -> wp.mat33:
 
 @wp.func
 def branch_stress(e: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
-    """Kirchhoff stress of a strain e = b - I: neo_hookean to first order in it."""
+    """Kirchhoff stress of a strain e = b - I: `neo_hookean` to first order in e."""
     return stiffness[0] * e + 0.5 * stiffness[1] * wp.trace(e) * wp.identity(n=3, dtype=float)
 
 
 @wp.func
 def _cofactors(A: wp.mat33) -> wp.mat33:
-    """Cofactor matrix: det(A) times the transposed inverse of A."""
+    """Cofactor matrix: det(A) times the inverse transpose of A."""
     a = wp.vec3(A[0, 0], A[0, 1], A[0, 2])
     b = wp.vec3(A[1, 0], A[1, 1], A[1, 2])
     c = wp.vec3(A[2, 0], A[2, 1], A[2, 2])
@@ -123,7 +126,7 @@ def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float)
 
 @wp.func
 def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp.vec4:
-    """Return mapping: Hencky strains (xyz) and volume gain (w, log) after projection to the Drucker-Prager cone."""
+    """Return mapping: Hencky strains (xyz) and log volume gain (w) after projection onto the Drucker-Prager cone."""
     third = state / 3.0
     e = strain + wp.vec3(third, third, third)
     trace = e[0] + e[1] + e[2]
@@ -143,9 +146,10 @@ def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp
 def material_update(
     model: int, trial: wp.mat33, stiffness: wp.vec3, plastic: wp.vec3, state: float, dt: float
 ) -> MaterialUpdate:
-    """Stress and plastic flow of any model of the module's table, without damping.
+    """Compute stress and plastic flow of any model of the module's table, without damping.
 
-    trial: deformation gradient; stiffness: mu, lambda [Pa], eta; plastic, state: see the table; dt [s].
+    `trial` is the trial deformation gradient; `stiffness` is mu, lambda [Pa], eta; for `plastic` and `state` see the
+    table; `dt` is in [s].
     """
     out = MaterialUpdate()
     out.F = trial
@@ -154,7 +158,7 @@ def material_update(
         out.tau = neo_hookean(trial, stiffness)
         return out
     if model == COROTATED and wp.determinant(trial) > MIN_VOLUME_RATIO:
-        out.tau = _corotated(trial, stiffness[0], stiffness[1])  # no SVD: four times as fast
+        out.tau = _corotated(trial, stiffness[0], stiffness[1])  # four times as fast as the SVD below
         return out
     U = wp.mat33()
     V = wp.mat33()
@@ -200,16 +204,16 @@ def material_update(
 
 
 def maxwell_branches(loss: float, omega: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Moduli, over the elastic ones, and relaxation rates [1/s] of two branches with a loss factor tan(delta) = `loss`.
+    """Return the moduli, relative to the elastic ones, and the relaxation rates [1/s] of two Maxwell branches.
 
-    It is exact at the angular frequencies omega [rad/s] and omega / BRANCH_RATIO. Between them it is at most 1.1 times
-    as large for a loss up to .3, and 1.3 times for MAX_LOSS; at 2 omega and at half the lower frequency .6 to .8 times.
-    Raises ValueError for a loss above MAX_LOSS.
+    The loss factor tan(delta) equals `loss` at the angular frequencies omega [rad/s] and omega / BRANCH_RATIO. Between
+    them it is at most 1.1 times `loss` for a loss up to .3, and 1.3 times for MAX_LOSS; at 2 omega and at half the
+    lower frequency it is .6 to .8 times `loss`. Raises ValueError for a loss above MAX_LOSS.
     """
     if not 0 <= loss <= MAX_LOSS:
         raise ValueError(f"a loss factor of {loss:g} is not between 0 and {MAX_LOSS:g}")
     rates = np.array([omega, omega / BRANCH_RATIO])
-    x = rates[:, None] / rates  # of row's frequency and column's branch
+    x = rates[:, None] / rates  # frequency (row) over relaxation rate of the branch (column)
     fast, slow = np.linalg.solve((x - loss * x**2) / (1 + x**2), np.full(2, loss))
     return (float(fast), float(slow)), (float(rates[0]), float(rates[1]))
 
@@ -217,8 +221,8 @@ def maxwell_branches(loss: float, omega: float) -> tuple[tuple[float, float], tu
 def sand_slope(degrees: float) -> float:
     """Slope of the Drucker-Prager cone for a friction angle [degrees], in Klar's form: |dev tau| = 3 slope x pressure.
 
-    Matched to Mohr-Coulomb in plane strain without dilatancy, at shear = sin(angle) x pressure. Klar's own choice,
-    sqrt(2/3) 2 sin / (3 - sin), is matched in triaxial compression and is a third stronger in shear.
+    Matches Mohr-Coulomb in plane strain without dilatancy, where shear = sin(angle) x pressure. Klar's own choice,
+    sqrt(2/3) 2 sin / (3 - sin), matches triaxial compression and is a third stronger in shear.
     """
     return math.sqrt(2) / 3 * math.sin(math.radians(degrees))
 

@@ -1,12 +1,12 @@
-"""Contact of bodies that have a velocity field each: no approach, Coulomb friction, free separation.
+"""Contact of bodies with separate velocity fields: no approach, Coulomb friction, free separation.
 
-Each body is scattered to a window of its own, as scenes of a batch are. Where windows overlap, bodies may have mass at
-the same node although they are a cell apart. Their gap there follows from the signed distance to the surface of each
-undeformed body at the node's material coordinates, which the nearest particle gives: X + F^-1 (place - x). A node
-on one body is moved to the nearest point of that body's surface, whose distance from the other is the gap; the smaller
-of both such gaps counts, so that an edge touches as early as a face. The normal is taken at the same point, from the
-body that has a face there: elsewhere the nearest face may be one that does not touch. Bodies approach by at most the
-gap in a substep. The floor is a plane in contact with every body.
+Each body is scattered to its own window of the grid, like the scenes of a batch. Where windows overlap, two bodies may
+have mass at the same node although they are a cell apart. The gap between them there follows from the signed distance
+to each undeformed body, evaluated at the material coordinates of the node, X + F^-1 (place - x), where X, F and x are
+those of the nearest particle. The node is projected onto the surface of one body, and the distance of this point from
+the other body is a gap; the smaller of the two gaps is used, so that edges make contact as early as faces. The normal
+is taken at the same point, from the body that has a face there, since the nearest face elsewhere may not be in contact.
+Bodies approach by at most the gap in a substep. The floor is a plane that may touch every body.
 Sources: Bardenhagen et al. 2001, "An improved contact algorithm for the material point method" (velocity fields);
 Kamrin, Rycroft and Nave 2012, "Reference map technique for finite-strain elasticity and fluid-solid interaction"
 (distances by material coordinates); Nairn, Hammerquist and Smith 2020, "New material point method contact algorithms
@@ -21,32 +21,32 @@ from stages.core.kernels.mpm.constitutive import SAND
 from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, NodeArrays, apply_walls, coulomb_contact, first_node
 from stages.core.kernels.mpm.transfers import FREE, LOST, ParticleArrays, Substep
 
-# Height above the floor or a held body up to which nodes stop [cells]. Stopping higher ones takes more of the energy of
-# an impact, lower ones alone let bodies sink further. With CONTACT_FLOOR_GAP (solver.py) chosen on a tower of six, the
-# rebound of a box and a slide.
+# Height above the floor or a held body up to which nodes are stopped [cells]. A larger value takes more energy out of
+# an impact, a smaller one lets bodies sink further. It was chosen together with CONTACT_FLOOR_GAP (solver.py) on a
+# tower of six, the rebound of a box and a slide.
 STATIC_REACH = 0.25
-CLEARLY = 1e-3  # difference of lengths of normals that rounding does not decide
-# substeps for which the nearest particles of nodes are kept; a particle moves a small part of a cell in one
+CLEARLY = 1e-3  # difference of the lengths of two normals that is larger than rounding errors
+# number of substeps for which the nearest particle of each node is kept; particles move little of a cell in one substep
 REFRESH = 4
-FLOOR_REST = 0.1  # gap at which bodies stop at the floor [cells], into which balls in a heap then sink by .17
-SWEEPS = 2  # over the pairs of a node with more than two bodies
+FLOOR_REST = 0.1  # gap above the floor at which bodies stop [cells]; the balls of a heap then sink by .17
+SWEEPS = 2  # sweeps over the pairs of bodies at a node with more than two bodies
 BLOCK_NODES = wp.constant(BLOCK**3)
 NONE = wp.constant(wp.int64(2**62))  # key of a node without particles
-ROW = wp.constant(wp.int64(2**32))  # a key is the squared distance of the nearest particle, times ROW, and its row
-FINENESS = 2.0**24  # units of squared distance in a cell
+ROW = wp.constant(wp.int64(2**32))  # a key is the squared distance of the nearest particle times ROW, plus its row
+FINENESS = 2.0**24  # units of squared distance in keys [1/cell^2]
 
 
 @wp.struct
 class ContactBodies:
-    """Signed distances to the surfaces of undeformed bodies, each on a lattice of its own, and their friction."""
+    """Signed distance fields of the undeformed bodies, each on its own lattice, and their friction."""
 
-    texels: wp.array[wp.vec4]  # gradient and signed distance [m], of all bodies
-    first: wp.array[int]  # texel of each body
-    size: wp.array[wp.vec3i]
+    texels: wp.array[wp.vec4]  # gradient and signed distance [m] at the lattice points of all bodies
+    first: wp.array[int]  # first texel of each body
+    size: wp.array[wp.vec3i]  # lattice points along each axis
     origin: wp.array[wp.vec3]  # material coordinates of the first texel [m]
-    spacing: wp.array[float]  # [m]
+    spacing: wp.array[float]  # distance between lattice points [m]
     friction: wp.array[float]  # Coulomb coefficient
-    all: wp.array[int]  # 0, 1, ...: the numbers of the bodies
+    all: wp.array[int]  # indices of all bodies: 0, 1, ...
 
 
 @wp.struct
@@ -55,21 +55,21 @@ class TouchingBlocks:
 
     corners: wp.array[int]  # first node of each block
     starts: wp.array[int]
-    present: wp.array[int]
+    present: wp.array[int]  # bodies
 
 
 @wp.struct
 class ContactPatch:
-    """A body at a node, near the particle of it that is nearest to the node."""
+    """A body in the neighbourhood of a node, linearised about its particle nearest to the node."""
 
     body: int
     node: int  # index over the grids of all bodies
-    place: wp.vec3  # of the node [m]
+    place: wp.vec3  # position of the node [m]
     held: bool
-    x: wp.vec3  # the particle [m]
-    X: wp.vec3  # its material coordinates [m]
-    inverse: wp.mat33  # of its deformation gradient
-    radius: float  # of a grain [m]; 0 where the body keeps its surface
+    x: wp.vec3  # position of the particle [m]
+    X: wp.vec3  # material coordinates of the particle [m]
+    inverse: wp.mat33  # inverse of the particle's deformation gradient
+    radius: float  # radius of a grain [m]; 0 if the body keeps its surface
 
 
 @wp.func
@@ -83,7 +83,7 @@ def _patch(rows: ParticleArrays, key: wp.int64, body: int, node: int, place: wp.
     out.x = rows.x[p]
     out.X = rows.rest[p]
     out.inverse = wp.inverse(rows.F[p])
-    if int(rows.model[p]) >= SAND:  # sand and snow flow and break, so that any particle may come to the surface
+    if int(rows.model[p]) >= SAND:  # sand and snow flow and break, so any particle may reach the surface
         out.radius = wp.pow(0.75 / wp.pi * rows.volume[p], 1.0 / 3.0)
     return out
 
@@ -117,7 +117,7 @@ def surface_at(bodies: ContactBodies, near: ContactPatch, place: wp.vec3) -> wp.
     arm = place - near.x
     if near.radius > 0.0:
         length = wp.length(arm)
-        normal = 0.5 * arm / wp.max(length, 1e-12)  # as at an edge, so that a body with a surface gives the normal
+        normal = 0.5 * arm / wp.max(length, 1e-12)  # short, as at an edge: a body that has a surface takes precedence
         return wp.vec4(normal[0], normal[1], normal[2], length - near.radius)
     s = shape_at(bodies, near.body, near.X + near.inverse * arm)
     gradient = wp.vec3(s[0], s[1], s[2])
@@ -129,15 +129,16 @@ def surface_at(bodies: ContactBodies, near: ContactPatch, place: wp.vec3) -> wp.
 
 @wp.func
 def _on_surface(s: wp.vec4, place: wp.vec3) -> wp.vec3:
-    """The nearest point of the surface, whose normal and distance are `s`."""
+    """Projection of a point onto the surface whose normal and signed distance there are `s`."""
     return place - s[3] * wp.normalize(wp.vec3(s[0], s[1], s[2]))
 
 
 @wp.func
 def _contact_normal(other: wp.vec4, own: wp.vec4) -> wp.vec3:
-    """Unit normal out of the other body at a point on the own one; that of the own one where it is on less of an edge.
+    """Unit contact normal at a point on the surface of the own body, pointing out of the other body.
 
-    `other` and `own` are the normals and distances of both bodies at that point.
+    `other` and `own` are the normals and signed distances of both bodies at that point. The opposite of the own normal
+    is used if it is clearly longer, which means that the other body has an edge there and the own body a face.
     """
     out = wp.vec3(other[0], other[1], other[2])
     back = wp.vec3(own[0], own[1], own[2])
@@ -148,7 +149,7 @@ def _contact_normal(other: wp.vec4, own: wp.vec4) -> wp.vec3:
 def _resolve_pair(
     grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, b: ContactPatch, dt: float
 ):
-    """Limit the approach of two bodies at a node to their gap, with friction; momentum is kept."""
+    """Limit the approach of two bodies at a node to their gap, with friction; conserves momentum."""
     place = a.place
     u = velocity[a.node]
     v = velocity[b.node]
@@ -193,7 +194,7 @@ def _resolve_floor(grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.v
 
 @wp.func
 def may_touch(grid: MpmGrid, sharers: wp.array[int], i: int, j: int, k: int) -> bool:
-    """Whether the block of a node may have contact: of several bodies (`sharers` of each block), or at the floor."""
+    """Whether the block of a node may have contact: it has several bodies (`sharers` per block) or is at the floor."""
     at = ((i // BLOCK) * (grid.nodes[1] // BLOCK) + j // BLOCK) * (grid.nodes[2] // BLOCK) + k // BLOCK
     return sharers[at] > 1 or float(k - k % BLOCK) <= (grid.face_low[2] - grid.origin[2]) / grid.dx + STATIC_REACH
 
@@ -203,7 +204,7 @@ def resolve_node(
     grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, present: wp.array[int],
     at: wp.vec3i, step: Substep,
 ):  # fmt: skip
-    """Contact at node `at` between those of the bodies `present` that reach it."""
+    """Resolve contact at node `at` between the bodies of `present` with particles near it, and with the floor."""
     node = (at[0] * grid.nodes[1] + at[1]) * grid.nodes[2] + at[2]
     place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     here = int(0)
@@ -238,9 +239,10 @@ def resolve_node(
 
 @wp.kernel(enable_backward=False)
 def find_nearest(grid: MpmGrid, rows: ParticleArrays, sharers: wp.array[int], nearest: wp.array[wp.int64]):
-    """The nearest particle of each body at the nodes of blocks that may have contact.
+    """Find the nearest particle of each body for the nodes of blocks that may have contact.
 
-    Lowers the keys `nearest` of the nodes to that of the particle; the order of the particles does not matter.
+    Takes the minimum of the nodes' keys `nearest` and the particle's key, so the order of the particles does not
+    matter.
     """
     p = wp.tid()
     if int(rows.held[p]) == LOST:
@@ -273,7 +275,7 @@ def find_nearest(grid: MpmGrid, rows: ParticleArrays, sharers: wp.array[int], ne
 def contact_step(
     grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, nodes: NodeArrays, blocks: TouchingBlocks, step: Substep
 ):
-    """Contact at one node of a block."""
+    """Resolve contact at one node of a block."""
     b = wp.tid() // BLOCK_NODES
     n = wp.tid() % BLOCK_NODES
     stride_y = grid.nodes[2]

@@ -1,8 +1,9 @@
-"""Exact transfers: fixed-point accumulation, whose sums do not depend on the order of the particles.
+"""Reproducible transfers: fixed-point accumulation, whose sums do not depend on the order of the particles.
 
-Floating-point sums on a GPU depend on the order of the threads. Here a node holds momentum and mass as 64-bit integers
-(two wp.vec4 of memory), with scale[0] quanta per kg m/s and scale[1] quanta per kg. Integer addition is associative, so
-a scene gives the same bytes in every run, for any order of its particles and any other scenes in the batch.
+Floating-point sums by atomics on a GPU depend on the order of the threads. Here a node holds momentum and mass as
+64-bit integers (in the memory of two wp.vec4), with scale[0] quanta per kg m/s and scale[1] quanta per kg. Integer
+addition is associative, so a scene gives bitwise equal results in every run, for any order of its particles and any
+other scenes in the batch.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ _G2P = """
 def scatter_exact(
     grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, affine: wp.mat44, scale: wp.vec2
 ):
-    """P2G in fixed point; arguments as `scatter_nodes`, with the quanta `scale`."""
+    """P2G in fixed point; arguments as for `scatter_nodes`, and the quanta `scale`."""
 
 
 @wp.func_native(STENCIL + _G2P + GATHER)
 def gather_exact(
     grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, scale: wp.vec2
 ) -> mat43:
-    """G2P from momenta in fixed point, without a floor; result as `gather_nodes`."""
+    """G2P from fixed-point momenta, without the floor condition; returns the same as `gather_nodes`."""
 
 
 @wp.func_native("""
@@ -64,7 +65,7 @@ def gather_exact(
     return wp::vec3(inverse * (float)at[0], inverse * (float)at[1], inverse * (float)at[2]);
 """)
 def velocity_exact(momentum: wp.array[wp.vec4], node: int, scale: wp.vec2) -> wp.vec3:
-    """Velocity [m/s] of one node in fixed point."""
+    """Velocity [m/s] of one node from its fixed-point momentum and mass."""
 
 
 @wp.func_native("""
@@ -80,12 +81,12 @@ def velocity_exact(momentum: wp.array[wp.vec4], node: int, scale: wp.vec2) -> wp
     }
 """)
 def velocity_from_exact(momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, scale: wp.vec2):
-    """Velocities [m/s] and masses [kg] of a row of four nodes from momenta in fixed point, which are cleared."""
+    """Compute velocities [m/s] and masses [kg] of a row of four nodes from fixed-point momenta, and clear these."""
 
 
 @wp.func
 def scatter_float(
     grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, weight: wp.mat33, affine: wp.mat44, scale: wp.vec2
 ):
-    """scatter_nodes with the signature of scatter_exact."""
+    """`scatter_nodes` with the signature of `scatter_exact`."""
     scatter_nodes(grid, momentum, stencil, weight, affine)

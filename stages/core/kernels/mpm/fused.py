@@ -1,9 +1,9 @@
-"""A whole substep of all particles in one launch: the order that is fastest on a GPU.
+"""A whole substep of all particles in one launch: the fastest launch order on a GPU.
 
 A thread gathers from one grid, dividing momentum by mass and applying walls as it reads, moves its particle, and
-scatters into a second grid; additional threads clear a third. The grids change roles every substep, so that there is no
-synchronisation within one. A particle that enters a new cell adds the blocks of its stencil to the list of active
-blocks, which is exact and never read by the host. Transfers, materials and walls are those of `transfers`.
+scatters into a second grid; additional threads clear a third. The grids rotate their roles every substep, so no
+synchronisation is needed within a substep. A particle that enters a new cell adds the blocks of its stencil to the list
+of active blocks, which is exact and never read by the host. Transfers, materials and walls are those of `transfers`.
 
 Source: Wang et al. 2020, "A massively parallel and scalable multi-GPU material point method" (fused transfers).
 """
@@ -54,7 +54,7 @@ class RotatingNodes:
 
     read: wp.array[wp.vec4]
     write: wp.array[wp.vec4]
-    stale: wp.array[wp.vec4]  # to be cleared
+    stale: wp.array[wp.vec4]  # cleared during this substep
     scale: wp.vec2  # fixed-point units, see exact.py; 0 in floating point
     friction: wp.array[float]  # Coulomb coefficient at floor and walls
 
@@ -75,7 +75,7 @@ def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
 
 @wp.func
 def _node_velocity(grid: MpmGrid, nodes: RotatingNodes, node: int, at: wp.vec3i) -> wp.vec3:
-    """Velocity of a node after the walls; the grid is in fixed point if `scale` is set (see `exact`)."""
+    """Velocity of a node after the wall conditions; the grid is in fixed point if `scale` is not 0 (see `exact`)."""
     v = wp.vec3()
     if nodes.scale[0] > 0.0:
         v = velocity_exact(nodes.read, node, nodes.scale)
@@ -87,7 +87,7 @@ def _node_velocity(grid: MpmGrid, nodes: RotatingNodes, node: int, at: wp.vec3i)
 
 @wp.func
 def _gather_walls(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
-    """As gather_momentum, for stencils with nodes subject to walls."""
+    """`gather_momentum` for stencils with nodes subject to walls."""
     s = mat43()
     for n in range(27):
         at = stencil.base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
@@ -98,7 +98,7 @@ def _gather_walls(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat4
 
 @wp.func
 def _gather_obstacles(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil, time: float) -> mat43:
-    """As gather_momentum, for stencils with nodes subject to walls or obstacles."""
+    """`gather_momentum` for stencils with nodes subject to walls or obstacles."""
     s = mat43()
     for n in range(27):
         at = stencil.base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
@@ -111,14 +111,14 @@ def _gather_obstacles(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil, tim
 
 @wp.func
 def _gather_free(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
-    """As gather_momentum, for stencils without nodes at walls, or at the floor only."""
+    """`gather_momentum` for stencils with nodes at no wall, or at the floor only."""
     under = grid.low[2] + 1 - stencil.base[2]
     return gather_momentum(grid, nodes.read, nodes.friction, stencil, bspline_weights(stencil.fx), under)
 
 
 @wp.func
 def _gather_free_exact(grid: MpmGrid, nodes: RotatingNodes, stencil: Stencil) -> mat43:
-    """As _gather_free, from fixed point, for stencils without nodes at floor or walls."""
+    """`_gather_free` from a fixed-point grid, for stencils without nodes at floor or walls."""
     return gather_exact(grid, nodes.read, stencil, bspline_weights(stencil.fx), nodes.scale)
 
 
@@ -131,12 +131,12 @@ def _at_sides(grid: MpmGrid, base: wp.vec3i) -> bool:
 
 @cache
 def fused_step(features: Features, has_obstacles: bool, exact: bool) -> wp.Kernel:
-    """Build the kernel with the features needed, since each one costs registers.
+    """Build the kernel with only the features needed, since each one costs registers.
 
-    `exact`: grids in fixed point (see `exact`).
+    `exact` selects fixed-point grids (see `exact`).
     """
     plastic, viscoelastic, restitution = features
-    # 80 registers per thread instead of 94 and a quarter more threads at once; fixed point needs more registers
+    # 80 registers per thread instead of 94, so that a quarter more threads run at once; fixed point needs more
     bounds = {} if exact else {"launch_bounds": (THREADS_PER_BLOCK, 6)}
     collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, scatter_float)
     walled = near_walls if exact else _at_sides
@@ -145,8 +145,11 @@ def fused_step(features: Features, has_obstacles: bool, exact: bool) -> wp.Kerne
     def fused_step(
         grid: MpmGrid, rows: ParticleArrays, nodes: RotatingNodes, active: ActiveBlocks, step: Substep, number: int
     ):  # fmt: skip
-        """Substep `number` of the frame, from 0. The first `sweepers` threads (a multiple of 32) each move a particle;
-        if these gather and scatter, as many more clear the grid `stale`."""
+        """Substep `number` of the frame, counted from 0.
+
+        The first `sweepers` threads (a multiple of 32) each move a particle; if the substep gathers and scatters, as
+        many additional threads clear the grid `stale`.
+        """
         i = wp.tid()
         if i >= active.sweepers:
             if step.scatter > 0 and step.gather > 0:
@@ -205,7 +208,7 @@ def fused_step(features: Features, has_obstacles: bool, exact: bool) -> wp.Kerne
             if step.gather > 0:
                 rows.x[i] = now.x
                 rows.F[i] = now.F
-                if step.scatter == 0:  # during a frame the velocity is only on the grid
+                if step.scatter == 0:  # between the substeps of a frame the velocity is only stored on the grid
                     rows.v[i] = now.v
                     rows.C[i] = now.C
             if step.scatter > 0 and now.alive:

@@ -1,9 +1,9 @@
 """Background grid: node layout, interpolation weights, and boundary conditions at walls and obstacles.
 
 A batch has one grid per scene, all of one shape, consecutive in memory. Walls and obstacles are conditions on the
-velocity of nodes: the inward normal component is removed, and Coulomb friction reduces the tangential one in
-proportion. Bodies then rebound by their own elasticity only. A surface with restitution instead acts on particles as a
-penalty spring, whose force is multiplied by restitution^2 on the way out. The result does not depend on the substep.
+velocity of nodes: the normal component into the surface is removed, and Coulomb friction reduces the tangential one in
+proportion. Bodies then rebound only by their own elasticity. A surface with restitution instead acts on particles as a
+penalty spring, whose force is multiplied by restitution^2 during rebound. The result does not depend on the substep.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from __future__ import annotations
 import warp as wp
 
 BLOCK = 4  # nodes along an edge of a block
-GRID_PADDING = 4  # nodes outside the walls on each side, for the stencils of particles pressed into a wall
+GRID_PADDING = 4  # nodes beyond the walls on each side, for the stencils of particles pressed into a wall
 FLOOR_GAP = 1.0  # [cells] distance of a resting body from the outermost constrained nodes (measured; see tests)
 OBSTACLE_OFFSET = FLOOR_GAP - 0.5  # [cells] depth of the outermost constrained nodes; see apply_obstacles
-RESTITUTION_MARGIN = 2.0  # [cells] added to that depth at surfaces with restitution
+RESTITUTION_MARGIN = 2.0  # [cells] added to OBSTACLE_OFFSET at surfaces with restitution
 REST_DISTANCE = 0.25  # [cells] distance of resting particles from a surface (measured; see tests)
 PLANE, SPHERE, BOX = 0, 1, 2  # shapes of obstacles (Obstacle.kind)
 SEPARATE, SLIP, STICKY = 0, 1, 2  # contact conditions (Obstacle.surface): Coulomb, free slip, no slip
@@ -45,7 +45,7 @@ class MpmGrid:
     low: wp.vec3i  # nodes with an index <= low or >= high are subject to the walls
     high: wp.vec3i
     count: int  # nodes per scene
-    restitution: float  # of floor and walls
+    restitution: float  # coefficient of restitution of floor and walls
     face_low: wp.vec3  # positions of the walls [m]; nodes `low` and `high` lie outside them
     face_high: wp.vec3
     spring: float  # circular frequency of the springs of surfaces with restitution [rad/s]
@@ -59,7 +59,7 @@ class NodeArrays:
     """Nodes of the grids of all scenes."""
 
     velocity: wp.array[wp.vec4]  # [m/s], and mass [kg]
-    momentum: wp.array[wp.vec4]  # [kg m/s], and mass [kg]; one or more copies, or in fixed point two rows a node
+    momentum: wp.array[wp.vec4]  # [kg m/s], and mass [kg]; one or more copies, or two rows per node in fixed point
     scale: wp.vec2  # fixed-point units of momentum and mass, see exact.py; 0 in floating point
     friction: wp.array[float]  # Coulomb coefficient at floor and walls
     nearest: wp.array[wp.int64]  # key of the nearest particle of each body in contact, see contact.py
@@ -67,11 +67,11 @@ class NodeArrays:
 
 @wp.struct
 class Stencil:
-    """The 3 x 3 x 3 nodes that a particle exchanges with."""
+    """The 3 x 3 x 3 nodes that a particle transfers to and from."""
 
     first: int  # index of the first node over all scenes; < 0: none
-    base: wp.vec3i  # the same along x, y and z in the grid of the scene
-    fx: wp.vec3  # distance of the particle from it [cells], in [0.5, 1.5)^3
+    base: wp.vec3i  # index of the first node along x, y and z in the grid of its scene
+    fx: wp.vec3  # offset of the particle from the first node [cells], in [0.5, 1.5)^3
 
 
 @wp.func
@@ -116,7 +116,7 @@ def stencil_at(grid: MpmGrid, x: wp.vec3, window: int) -> Stencil:
 
 @wp.func
 def empty_stencil() -> Stencil:
-    """Stencil of a thread without a particle: no nodes."""
+    """Stencil without nodes, for a thread without a particle."""
     out = Stencil()
     out.first = -1
     out.fx = wp.vec3(1.0, 1.0, 1.0)
@@ -143,7 +143,7 @@ def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
 def _spring(v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, rate: float) -> wp.vec3:
     """Velocity of a particle after a substep under a surface's penalty spring and friction.
 
-    depth: from REST_DISTANCE [m]; rate: velocity gained per depth [1/s].
+    `depth` is measured from REST_DISTANCE [m]; `rate` is the velocity gained per unit of depth [1/s].
     """
     if depth <= 0.0:
         return v
@@ -175,7 +175,7 @@ def near_walls(grid: MpmGrid, base: wp.vec3i) -> bool:
 
 @wp.func
 def apply_walls(grid: MpmGrid, at: wp.vec3i, velocity: wp.vec3, friction: float) -> wp.vec3:
-    """Velocity of node `at` after the conditions of floor, ceiling and walls, in this order."""
+    """Velocity of node `at` after the conditions of floor, ceiling and walls, applied in this order."""
     v = velocity
     if at[2] <= grid.low[2]:
         v = _wall(grid, v, wp.vec3(0.0, 0.0, 1.0), friction)

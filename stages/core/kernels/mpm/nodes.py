@@ -1,8 +1,8 @@
-"""Inner loops of the particle-grid transfers, in C++ and CUDA.
+"""Inner loops of the particle-grid transfers (P2G and G2P), in C++ and CUDA.
 
 A node is four floats: x, y, z of velocity or momentum, and mass. On the CPU a row of four nodes along z is one 16-lane
 SIMD vector, of which three nodes have non-zero weight. On CUDA a node is one 16-byte load or one vector atomic.
-`weight` are the `grid.bspline_weights` of the stencil.
+`weight` is the result of `grid.bspline_weights` for the stencil.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from stages.core.kernels.mpm.grid import MpmGrid, Stencil
 
 mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 
-# The index of the stencil's first node, the strides [nodes], and the distance of the particle from that node [cells].
+# Index of the stencil's first node, strides [nodes], and offset of the particle from the first node [cells].
 STENCIL = """
     const int first = stencil.first, stride_y = grid.nodes.c[2], stride_x = grid.nodes.c[1] * stride_y;
     const wp::vec3 fx = stencil.fx;
 """
 
-# P2G node by node. `value_of` gives what is added to number n of a node; `add` does so atomically, on CUDA only, where
-# consecutive lanes whose particles share a cell (a run) are summed before: lane l sums lanes l to l + 7 of its run, and
-# every eighth lane of a run writes. All 32 lanes of the warp must take part.
+# P2G node by node. `value_of` converts a sum to what is added to component n of a node. On CUDA, `add` does so with
+# atomics, after a warp-level reduction over runs of consecutive lanes whose particles share a cell: lane l sums lanes l
+# to l + 7 of its run, and every eighth lane of a run writes. All 32 lanes of the warp must take part.
 SCATTER = """
 #if defined(__CUDA_ARCH__)
     const unsigned all = 0xffffffffu;
@@ -68,8 +68,8 @@ SCATTER = """
     }
 """
 
-# G2P from momentum: `weigh` sets u to the velocity, times its weight, of node (i, j, k) of the stencil, whose four
-# numbers are at `node`.
+# G2P from momentum: `weigh` sets u to the weighted velocity of node (i, j, k) of the stencil, whose four components are
+# at `node`.
 GATHER = """
     wp::mat_t<4, 3, wp::float32> out;
     for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
@@ -255,7 +255,7 @@ def scatter_nodes(grid: MpmGrid, momentum: wp.array[wp.vec4], stencil: Stencil, 
 def velocity_from_momentum(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
 ):
-    """Velocities and masses of a row of four nodes from the sum of the momentum copies, which are cleared.
+    """Compute velocities and masses of a row of four nodes from the sum of the momentum copies, and clear the copies.
 
     Bit c of `copies` is set if copy c, which starts at node c x count, may be non-zero.
     """

@@ -1,10 +1,10 @@
-"""Velocities of the nodes at the face of a pinned part: a linear profile that vanishes at the face.
+"""Boundary condition at the face of a pinned part: node velocities follow a linear profile that vanishes at the face.
 
-If the nodes that pinned particles reach were held, nothing within a cell of the face could deform, as if the part ended
-further out. So nodes less than OUTSIDE cells outside the part are slaves of a node further outside, their master: at
-signed distances d and D from the face, their velocities are in the ratio d / D, which is negative inside. Momentum and
-mass of a slave go to its master in the ratio of their velocities: Galerkin's method with these linear combinations of
-B-splines, so that the stable substep is no shorter than without pins.
+If all nodes in the stencils of pinned particles were held, nothing within a cell of the face could deform, as if the
+part were larger. Instead, nodes less than OUTSIDE cells outside the part are slaves of a master node further outside:
+with signed distances d and D of slave and master from the face, their velocities have the ratio d / D, which is
+negative inside. The momentum and mass of a slave are transferred to its master with this ratio, as in Galerkin's method
+with these linear combinations of B-splines, so the stable substep is no shorter than without pins.
 Source: Hoellig, Reif and Wipper 2001, "Weighted extended B-spline approximation of Dirichlet problems" (the distance as
 weight function, and the extension of splines whose support crosses the boundary), here with velocities of nodes.
 """
@@ -18,17 +18,20 @@ from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 
 @wp.struct
 class PinnedNodes:
-    """Masters, each with the slaves `starts[n] : starts[n + 1]`; nodes over all scenes. Pinned parts are at rest."""
+    """Master nodes n with the slaves `starts[n] : starts[n + 1]`; node indices are over all scenes.
 
-    masters: wp.array[int]  # -1: of a slave that stays at rest
+    Pinned parts are at rest.
+    """
+
+    masters: wp.array[int]  # -1 for slaves that stay at rest
     starts: wp.array[int]
     slaves: wp.array[int]
-    ratio: wp.array[float]  # of the velocities of a slave and its master
+    ratio: wp.array[float]  # velocity of each slave over the velocity of its master
 
 
 @wp.kernel(enable_backward=False)
 def pin_nodes(pins: PinnedNodes, velocity: wp.array[wp.vec4]):
-    """Set the velocities and masses of a master and its slaves; for contact a slave is as heavy as what is pinned."""
+    """Set the velocities and masses of a master and its slaves; for contact, slaves have the mass of pinned nodes."""
     n = wp.tid()
     master = pins.masters[n]
     momentum = wp.vec3()

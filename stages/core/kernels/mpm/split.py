@@ -1,9 +1,10 @@
-"""A substep as two launches, particles and then grid: the order that is fastest on a CPU.
+"""A substep as two launches, particles and then grid: the fastest launch order on a CPU.
 
 `particle_step` gathers velocities from the grid (G2P), moves the particles and scatters their momentum and stress for
 the next substep (P2G); `grid_step` divides momentum by mass and applies floor, walls and obstacles. Several CPU threads
-may scatter at once, each into its own copy of the momentum; each block lists the copies that it may occur in. On a GPU
-the particle kernel sums in fixed point (see `exact`) and lists the active blocks itself (see `active`).
+may scatter at once, each into its own copy of the momentum; for each block, bits tell in which copies it may be
+non-zero. On a GPU the particle kernel sums in fixed point (see `exact`) and lists the active blocks itself (see
+`active`).
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ from stages.core.kernels.mpm.transfers import (
 
 @wp.struct
 class ParticlePart:
-    """Particles start to stop - 1, and the copy of the momentum that they are scattered into."""
+    """A range of particles, and the copy of the momentum that they scatter into."""
 
     start: int
-    stop: int
-    copy: int  # its first node
+    stop: int  # one past the last particle
+    copy: int  # first node of the copy
 
 
 @cache
 def particle_step(features: Features, exact: bool = False) -> wp.Kernel:
     """Build the particle kernel with these features.
 
-    `exact`: it scatters in fixed point, and lists active blocks instead of setting `stale`.
+    With `exact` it scatters in fixed point, and lists active blocks instead of setting `stale`.
     """
     plastic, viscoelastic, restitution = features
     add = scatter_exact if exact else scatter_float
@@ -65,7 +66,7 @@ def particle_step(features: Features, exact: bool = False) -> wp.Kernel:
     def particle_step(
         grid: MpmGrid, rows: ParticleArrays, part: ParticlePart, nodes: NodeArrays, active: ActiveBlocks, step: Substep
     ):  # fmt: skip
-        """One particle of a part."""
+        """Advance one particle of a part."""
         i = part.start + wp.tid()
         dt = step.dt
         target = empty_stencil()
@@ -126,9 +127,9 @@ def particle_step(features: Features, exact: bool = False) -> wp.Kernel:
 
 @wp.kernel(enable_backward=False)
 def grid_step(grid: MpmGrid, start: int, nodes: NodeArrays, blocks: wp.array[wp.vec2i], clock: wp.array[float]):
-    """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
+    """Update one row of four nodes of an active block.
 
-    clock: as in Substep.
+    `blocks` holds the first node of each block and the bits of its copies; `clock` is as in Substep.
     """
     t = start + wp.tid()
     block = blocks[t // (BLOCK * BLOCK)]
@@ -147,7 +148,7 @@ def grid_step(grid: MpmGrid, start: int, nodes: NodeArrays, blocks: wp.array[wp.
 
 @wp.kernel(enable_backward=False)
 def mark_blocks(grid: MpmGrid, rows: ParticleArrays, start: int, bit: int, marks: wp.array4d[int]):
-    """Mark the blocks (scene, i, j, k) of a particle's stencil, for motions of up to one cell, with `bit`."""
+    """Mark with `bit` the blocks (scene, i, j, k) that a particle's stencil reaches if it moves by up to one cell."""
     i = start + wp.tid()
     if rows.held[i] == wp.int8(LOST):
         return
@@ -168,7 +169,7 @@ def mark_blocks(grid: MpmGrid, rows: ParticleArrays, start: int, bit: int, marks
 def mark_friction(grid: MpmGrid, rows: ParticleArrays, friction: wp.array[float]):
     """Set the friction coefficient of nodes at floor and walls to the maximum over the particles near them.
 
-    "Near" includes motions of up to one cell; the fused order takes actual stencils only, so that the two orders can
+    "Near" includes motions of up to one cell. The fused order uses only the actual stencils, so the two orders can
     differ where bodies with different friction coefficients are closer than a cell.
     """
     i = wp.tid()

@@ -1,7 +1,7 @@
-"""MLS-MPM with APIC transfers and quadratic B-splines, for batches of scenes: the code common to both launch orders.
+"""MLS-MPM with APIC transfers and quadratic B-splines for batches of scenes: code shared by both launch orders.
 
-`fused` does a whole substep in one launch, which is fastest on a GPU; `split` launches particles and grid in turn,
-which is fastest on a CPU: division by mass and walls are then evaluated once per node instead of 27 times per particle.
+`fused` does a whole substep in one launch, which is fastest on a GPU. `split` launches particles and grid in turn,
+which is fastest on a CPU, because mass division and walls are evaluated once per node instead of 27 times per particle.
 
 The grids are dense in memory, but only blocks of 4 x 4 x 4 nodes near particles are read, written and cleared.
 
@@ -23,13 +23,13 @@ from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, first_node, stencil_ins
 from stages.core.kernels.mpm.nodes import mat43
 
 KINEMATIC_MASS_FACTOR = 1e4  # mass factor of kinematic particles on the grid, so that they impose their velocity
-# values of `held`: moved by the grid, by its own velocity, or outside the grid; or as KINEMATIC, but not on the grid,
-# where the velocities of nodes are set instead (pins.py)
+# Values of `held`. FREE: moved by the grid; KINEMATIC: moved by its own velocity; LOST: outside the grid; PINNED: as
+# KINEMATIC, but not scattered to the grid, where the velocities of nodes are set instead (pins.py).
 FREE, KINEMATIC, LOST, PINNED = 0, 1, 2, 3
 
 
 class Features(NamedTuple):
-    """What the particles of a kernel need beside neo-Hookean elasticity."""
+    """Features that a kernel needs besides neo-Hookean elasticity."""
 
     plastic: bool  # other material models
     viscoelastic: bool  # Maxwell branches
@@ -47,7 +47,7 @@ class ParticleArrays:
     C: wp.array[wp.mat33]  # APIC velocity gradient [1/s]
     F: wp.array[wp.mat33]  # deformation gradient, elastic part
     mass: wp.array[float]  # [kg]
-    volume: wp.array[float]  # at rest [m^3]
+    volume: wp.array[float]  # undeformed volume [m^3]
     stiffness: wp.array[wp.vec3]  # mu, lambda [Pa], eta [Pa s]
     friction: wp.array[float]
     held: wp.array[wp.int8]
@@ -57,7 +57,7 @@ class ParticleArrays:
     branch_modulus: wp.array[wp.vec2]  # see constitutive.py, also for `branch_rate` and `branch_strain`
     branch_rate: wp.array[wp.vec2]  # [1/s]
     branch_strain: wp.array2d[wp.mat33]
-    acceleration: wp.array[wp.vec3]  # of external forces [m/s^2]
+    acceleration: wp.array[wp.vec3]  # due to external forces [m/s^2]
     scene: wp.array[int]
     order: wp.array[int]  # original row
     base_node: wp.array[wp.vec3i]  # first node of the stencil when the list of blocks was made
@@ -72,23 +72,23 @@ class ParticleUpdate:
     v: wp.vec3
     C: wp.mat33
     F: wp.mat33
-    tau: wp.mat33  # Kirchhoff stress without that of damping [Pa]
+    tau: wp.mat33  # Kirchhoff stress without damping [Pa]
     alive: bool
 
 
 @wp.struct
 class Substep:
-    """A substep, and what is done in it."""
+    """Length of a substep, and the parts of it to carry out."""
 
     dt: float  # [s]
-    clock: wp.array[float]  # time since the start of the frame [s], for moving obstacles; not in the fused order
+    clock: wp.array[float]  # time since the start of the frame [s], for moving obstacles; unused by the fused order
     gather: int  # 1: particles gather velocities from the grid (G2P) and move
     scatter: int  # 1: particles scatter momentum and stress (P2G) for the next substep
-    forget: int  # 1: nodes forget their nearest particles, so that find_nearest follows
+    forget: int  # 1: clear the nearest particles of nodes, so that find_nearest must follow
 
 
 def substep(dt: float, gather: int = 0, scatter: int = 0, clock: wp.array | None = None, forget: int = 0) -> Substep:
-    """The struct with these values."""
+    """Return a Substep with these values."""
     step = Substep()
     step.dt, step.gather, step.scatter, step.clock, step.forget = dt, gather, scatter, clock, forget
     return step
@@ -96,7 +96,7 @@ def substep(dt: float, gather: int = 0, scatter: int = 0, clock: wp.array | None
 
 @wp.func
 def advance_free(grid: MpmGrid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> ParticleUpdate:
-    """Advance a free particle by `dt` [s] with the stencil sums `s` of G2P; one that would leave the grid is lost."""
+    """Advance a free particle by `dt` [s] with the G2P stencil sums `s`; it is lost if it would leave the grid."""
     out = ParticleUpdate()
     k = 4.0 / grid.dx
     out.v = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
@@ -122,7 +122,7 @@ def lost_particle(x: wp.vec3, F: wp.mat33) -> ParticleUpdate:
 
 @wp.func
 def advance_kinematic(grid: MpmGrid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> ParticleUpdate:
-    """Advance a kinematic particle by `dt` [s] at its own velocity; 0 returns its current state."""
+    """Advance a kinematic particle by `dt` [s] at its own velocity; dt = 0 returns its current state."""
     out = ParticleUpdate()
     out.x = x + dt * v
     out.v = v
@@ -145,13 +145,13 @@ def mark_lost(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, 
 def affine_momentum(
     grid: MpmGrid, rows: ParticleArrays, i: int, now: ParticleUpdate, held: int, dt: float
 ) -> wp.mat44:  # fmt: skip
-    """P2G contribution of particle i: row 0 momentum and mass, rows 1 to 3 their change per cell along x, y, z.
+    """P2G contribution of particle i: row 0 is momentum and mass, rows 1 to 3 their change per cell along x, y, z.
 
-    APIC momentum with RPIC damping, and the MLS-MPM stress impulse in `dt` [s].
+    Consists of the APIC momentum with RPIC damping, and the MLS-MPM stress impulse over `dt` [s].
     """
     m = rows.mass[i]
     both = now.C + wp.transpose(now.C)
-    tau = now.tau + rows.stiffness[i][2] * both  # read again: it would take a register since the stress
+    tau = now.tau + rows.stiffness[i][2] * both  # read again: keeping it since the stress update would cost a register
     A = (grid.dx * m) * (now.C - (0.5 * grid.damping) * both) - (dt * 4.0 / grid.dx * rows.volume[i]) * tau
     q = m * (now.v + dt * rows.acceleration[i])
     if held != FREE:
@@ -164,7 +164,7 @@ def affine_momentum(
 
 @wp.func
 def relax(rows: ParticleArrays, i: int, now: ParticleUpdate, stiffness: wp.vec3, dt: float) -> wp.mat33:
-    """Kirchhoff stress [Pa] of the Maxwell branches of particle i, whose strains are advanced by `dt` [s]."""
+    """Advance the strains of the Maxwell branches of particle i by `dt` [s]; return their Kirchhoff stress [Pa]."""
     modulus = rows.branch_modulus[i]
     rate = rows.branch_rate[i]
     together = wp.mat33()
@@ -177,7 +177,7 @@ def relax(rows: ParticleArrays, i: int, now: ParticleUpdate, stiffness: wp.vec3,
 
 @wp.kernel(enable_backward=False)
 def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
-    """Sort keys by scene, block, and cell within the block, for memory locality; lost particles come last."""
+    """Compute sort keys by scene, block, and cell within the block, for memory locality; lost particles come last."""
     i = wp.tid()
     if rows.held[i] == wp.int8(LOST):
         keys[i] = 2147483647
@@ -191,10 +191,10 @@ def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
 def substep_reference(
     rows: dict[str, Tensor], grid: MpmGrid, friction: float, dt: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One substep of `dt` [s] of free neo-Hookean particles in PyTorch: specification of the kernels.
+    """One substep of `dt` [s] of free neo-Hookean particles in PyTorch, which specifies the kernels.
 
-    rows: x, v, C, F, mass, volume, stiffness, acceleration and the columns of Maxwell branches, if there are any, as in
-    ParticleArrays; `friction` of floor and walls. Returns x, v, C, F.
+    `rows` holds x, v, C, F, mass, volume, stiffness, acceleration and the columns of the Maxwell branches as in
+    ParticleArrays; `friction` is that of floor and walls. Returns x, v, C, F.
     """
     v, C, F, mass, volume, stiffness = (rows[k] for k in ("v", "C", "F", "mass", "volume", "stiffness"))
     dx, nodes, origin = grid.dx, tuple(grid.nodes), torch.tensor(list(grid.origin)).to(v)

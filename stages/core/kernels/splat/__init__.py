@@ -1,1 +1,1 @@
-"""Gaussian splatting on the CPU (projection, binning, compositing and their adjoints) and the SSIM image loss."""
+"""Gaussian splatting (projection, binning, compositing and their adjoints), and the SSIM and photometric losses."""

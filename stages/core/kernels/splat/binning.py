@@ -1,7 +1,7 @@
-"""Binning: the splats that overlap each bin of the image, sorted by depth.
+"""Binning on the CPU: lists of the splats that overlap each bin of the image, sorted by depth.
 
-The splats are sorted by depth once and appended in that order to the bins that they overlap, which leaves every bin
-sorted: fewer keys than one for each pair of splat and bin.
+The splats are sorted by depth once and appended in that order to the bins that they overlap, so every bin is sorted.
+This sorts fewer keys than one per pair of splat and bin.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ for (int pass = 0; pass < 3; ++pass) {
 total.data[0] = m;
 """
 
-# The range of a part, in locals: stores to other arrays must not make the compiler read the struct again.
+# The range of a part, in local variables, so that stores to other arrays do not make the compiler reload the struct.
 _RANGE = r"""
 const int begin = splats.bounds.data[piece], end = splats.bounds.data[piece + 1], across = splats.across;
 const int* ids = splats.ids.data;
 const short* rects = splats.rects.data;
 """
 
-# Counting pass: each part counts its range of the order, which gives its write position in every bin.
+# Counting pass: each part counts the splats of its range per bin, which gives its write position in every bin.
 _COUNT = r"""
 const int bins = counts.shape[1];
 int* count = counts.data + (long)piece * bins;
@@ -84,23 +84,23 @@ for (int i = begin; i < end; ++i) {
 
 @wp.struct
 class SplatOrder:
-    """The visible splats by depth, in ranges that are worked on in parallel, and the bins that each overlaps."""
+    """The visible splats in order of depth, divided into ranges for parallel work, and the bins that each overlaps."""
 
-    ids: wp.array[int]  # (n,), indices of splats; those outside the ranges are unused
-    bounds: wp.array[int]  # (pieces + 1,), ranges of this order
+    ids: wp.array[int]  # (n,), indices of splats, nearest first; entries outside the ranges are unused
+    bounds: wp.array[int]  # (pieces + 1,), bounds of the ranges
     firsts: wp.array[int]  # (pieces,), slot of the first splat of each range
-    rects: wp.array2d[wp.int16]  # (n, 4), first column and row and last ones of the bins of each splat
-    across: int  # bins in a row
+    rects: wp.array2d[wp.int16]  # (n, 4), bins of each splat: first column, first row, last column, last row
+    across: int  # bins per row of the image
 
 
 @wp.struct
 class BinnedSplats:
-    """Splats and the lists of those in each bin; see `Bins`."""
+    """Splats and the lists of the splats in each bin; see `Bins`."""
 
     splats: wp.array2d[float]  # (n, 16)
     members: wp.array[int]  # (m,)
     starts: wp.array[int]  # (bins + 1,)
-    ends: wp.array[int]  # (bins,), one past the last member of each bin that compositing came to
+    ends: wp.array[int]  # (bins,), one past the last member of each bin that compositing processed
     slots: wp.array[int]  # (m,)
 
 
@@ -143,25 +143,28 @@ class Bins:
 
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
-    slots: Tensor  # (m,) int32, position of each member in the list by splat: nearest splat first, its bins row by row
+    slots: Tensor  # (m,) int32, position of each member in the list by splat: nearest splat first, bins in row order
     order: SplatOrder
     width: int  # [px]
     height: int
 
     def of(self, splats: Tensor, ends: Tensor | None = None) -> BinnedSplats:
-        """These bins of splats (n, 16) for kernels, and where compositing ended in each of them (bins,), if it has."""
+        """Return the bins with their splats (n, 16) for kernels; `ends` (bins,) is where compositing ended in each."""
         tensors = {"splats": splats, "members": self.members, "starts": self.starts, "slots": self.slots}
         return with_arrays(BinnedSplats(), tensors if ends is None else {**tensors, "ends": ends})
 
     def balanced_bounds(self, count: int, work: Tensor | None = None) -> list[int]:
-        """Bounds of at most `count` ranges of bins with about equal work (bins,), by default the number of members."""
+        """Return the bounds of at most `count` ranges of bins with about equal work.
+
+        `work` (bins,) is by default the number of members of each bin.
+        """
         work = self.starts.diff() if work is None else work
         total = (work + 1).cumsum(0).double()
         cuts = torch.searchsorted(total, total[-1] * torch.arange(1, count) / count)
         return sorted({0, *cuts.tolist(), len(work)})
 
     def with_any(self, which: Tensor) -> Bins:
-        """The same without the members of bins that hold none of the splats `which` (n,). Not for gradients."""
+        """Return a copy without the members of bins that hold none of the splats `which` (n,); not for gradients."""
         bins, counts = len(self.starts) - 1, self.starts.diff()
         bin_of = torch.repeat_interleave(torch.arange(bins), counts)
         kept = torch.zeros(bins, dtype=torch.bool)
@@ -171,7 +174,7 @@ class Bins:
 
 
 def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN_SIZE) -> Bins:
-    """Sort splats into bins of `side` pixels, by sort keys (n,) and bin rectangles (n, 4) as `project` returns them."""
+    """Sort splats into bins of `side` pixels, given the sort keys (n,) and bin rectangles (n, 4) from `project`."""
     n, across, down = len(keys), -(-width // side), -(-height // side)
     bins = across * down
     order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
@@ -194,6 +197,6 @@ def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int =
 
 
 def depth_order_reference(splats: Tensor) -> Tensor:
-    """Indices of all visible splats, nearest first: the members of a single bin over the whole image."""
+    """Return the indices of all visible splats, nearest first: the members of a single bin over the whole image."""
     visible = (splats[:, 11] > 0).nonzero()[:, 0]
     return visible[splats[visible, 9].argsort(stable=True)]

@@ -1,4 +1,4 @@
-"""What splats are composited onto, as the kernels of both devices see it: see `compositing` and `compositing_cuda`."""
+"""Images and per-pixel state of compositing, shared by the kernels of `compositing` and `compositing_cuda`."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from stages.core.kernels.interop import with_arrays
 
 @wp.struct
 class Canvas:
-    """The images of a view over their background, and the state of each pixel, from which the adjoint goes back."""
+    """The images of a view over their background, and the final state of each pixel, from which the adjoint starts."""
 
     behind: wp.array[float]  # the background: a colour (3,) or an image (h * w * 3,)
     mean: int  # whether the fourth channel is divided by alpha
     rgb: wp.array3d[float]  # (h, w, 3)
     fourth: wp.array2d[float]  # (h, w)
     alpha: wp.array2d[float]  # (h, w)
-    left: wp.array[float]  # transmittance left at each pixel, on a CPU by block and lane
+    left: wp.array[float]  # final transmittance of each pixel; on a CPU ordered by block and lane
     stops: wp.array[int]  # position in the list of its bin or tile at which each pixel was finished
 
 
 @wp.struct
 class ImageGradients:
-    """The gradients of the loss by the images of a canvas."""
+    """Gradients of the loss with respect to the images of a canvas."""
 
     rgb: wp.array3d[float]  # (h, w, 3)
     fourth: wp.array2d[float]  # (h, w)
@@ -31,12 +31,15 @@ class ImageGradients:
 
 
 def canvas_over(behind: Tensor, mean: bool, **arrays: Tensor) -> Canvas:
-    """A canvas with these arrays over a background colour (3,) or image (h, w, 3)."""
+    """Return a canvas with these arrays over a background colour (3,) or image (h, w, 3).
+
+    With `mean` the fourth channel is divided by alpha.
+    """
     canvas = with_arrays(Canvas(), {"behind": behind.view(-1), **arrays})
     canvas.mean = int(mean)
     return canvas
 
 
 def image_gradients(*gradients: Tensor) -> ImageGradients:
-    """The gradients of the images rgb, fourth channel and alpha, for kernels."""
+    """Return the gradients of the images rgb, fourth channel and alpha, for kernels."""
     return with_arrays(ImageGradients(), dict(zip(ImageGradients.vars, gradients, strict=True)))

@@ -1,7 +1,7 @@
-"""Front-to-back compositing of binned splats: on the CPU 16 pixels (4 x 4) at a time, on CUDA by `compositing_cuda`.
+"""Front-to-back alpha compositing of binned splats: 16 pixels (4 x 4) at a time on the CPU, `compositing_cuda` on CUDA.
 
-The state of a bin's 64 blocks of pixels stays in the first-level cache during one pass over the bin's splats. 64-bit
-masks hold the blocks that a splat overlaps and the blocks that are not yet finished.
+The state of a bin's 64 blocks of pixels stays in the L1 cache during one pass over the bin's splats. 64-bit masks hold
+the blocks that a splat overlaps and the blocks that are not yet finished.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ for _name, _value in (
 
 @cache
 def _forward(track: bool) -> wp.Kernel:
-    """Build the kernel; `track`: with the dominant splat of each pixel, `index`, and the splats' `totals`."""
+    """Build the kernel; with `track` it also writes the dominant splat of each pixel, `index`, and the `totals`."""
     macro = f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n"
 
     @wp.func_native(macro + VECTORS + BIN_BLOCKS + _FORWARD + "\n#undef TRACK\n")
@@ -118,7 +118,7 @@ def _forward(track: bool) -> wp.Kernel:
 
 def _draw(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, index: Tensor | None = None,
           totals: Tensor | None = None) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:  # fmt: skip
-    """Images (rgb, fourth, alpha) and saved state (left, stops, ends); fills `index` and `totals` if given."""
+    """Return images (rgb, fourth, alpha) and saved state (left, stops, ends); fills `index` and `totals` if given."""
     count, size = len(bins.starts) - 1, (bins.height, bins.width)
     left, stops = torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32)
     ends = torch.empty(count, dtype=torch.int32)
@@ -149,11 +149,11 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, mean: bool = False):
-    """Composite splats (n, 16): image (h, w, 3), fourth channel (h, w) and alpha (h, w). Differentiable in the splats.
+    """Composite splats (n, 16) to an image (h, w, 3), fourth channel (h, w) and alpha (h, w); differentiable in splats.
 
     `behind` is a background colour (3,) or image (h, w, 3), black when None. The fourth channel is composited like the
-    others or, with `mean`, divided by alpha. In the splats' gradient, columns 10 and 11 hold the sums over pixels of
-    the absolute gradients of the centre, for densification: the signed ones cancel where a splat is larger than the
+    others and, with `mean`, divided by alpha. In the splats' gradient, columns 10 and 11 hold the sums over pixels of
+    the absolute gradients of the centre, for densification: signed gradients cancel where a splat is larger than the
     detail it covers.
     Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
     """
@@ -162,12 +162,15 @@ def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, 
 
 
 def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """`composite` over black with `mean`; the splat with the largest weight in each pixel (h, w; -1: none), and each
-    splat's total weight (n,) [px]. Not differentiable."""
+    """`composite` over black with `mean`, and the dominant splats; not differentiable.
+
+    Additionally returns the splat with the largest weight in each pixel (h, w; -1: none), and the total weight (n,) of
+    each splat [px].
+    """
     if splats.is_cuda:
         return compositing_cuda.composite_with_dominant(splats, bins)
     index = torch.empty(bins.height, bins.width, dtype=torch.int32)
-    totals = torch.zeros(len(bins.members))  # of each pair of bin and splat
+    totals = torch.zeros(len(bins.members))  # total weight of each pair of bin and splat
     images, _ = _draw(splats, bins, torch.zeros(3), True, index, totals)
     return *images, index.long(), torch.bincount(bins.members, totals, len(splats)).float()
 
@@ -175,9 +178,9 @@ def composite_with_dominant(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor,
 def composite_reference(
     splats: Tensor, order: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image, fourth channel and alpha as `composite` returns them, and the weights (h, w, m) of the splats in `order`.
+    """`composite` in PyTorch, in any precision; evaluates every splat at every pixel, so only for small scenes.
 
-    `order` (m,) lists splats from near to far. PyTorch, every splat at every pixel: for small scenes, any precision.
+    `order` (m,) lists splats from near to far. Additionally returns the weights (h, w, m) of the splats in `order`.
     """
     s = splats[order]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")

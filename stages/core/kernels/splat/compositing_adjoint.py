@@ -1,6 +1,6 @@
-"""Adjoint of compositing: the splats of each bin back to front, 16 pixels at a time.
+"""Adjoint of compositing on the CPU: processes the splats of each bin back to front, 16 pixels at a time.
 
-Written out by hand, since Warp's automatic adjoint of such a loop is wrong.
+Written by hand, since Warp's automatic adjoint of such a loop is wrong.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from stages.core.kernels.threads import small_operations
 
 wp.set_module_options({"enable_backward": False})
 
-# dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution from behind: the sum of w (colour . v) over
-# the later splats, minus T_end v_alpha. Sums over the pixels of a bin are stored as moments of d, a row for each pair
-# of bin and splat; after all bins they are added up and converted to gradients of centre and covariance.
+# dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution of what lies behind: the sum of
+# w (colour . v) over the later splats, minus T_end v_alpha. Sums over the pixels of a bin are stored as moments of the
+# offset d, one row per pair of bin and splat; after all bins they are summed and converted to gradients of centre and
+# covariance.
 _BACKWARD = r"""
 F T[BLOCKS], S[BLOCKS], v[BLOCKS][4];
 I stop[BLOCKS];  // index of the splat at which a pixel finished
@@ -94,8 +95,8 @@ for (int k = reached - 1; k >= begin; --k) {
 }
 """.replace("MAX_ALPHA", f"{MAX_ALPHA}f").replace("MIN_MEAN_ALPHA", f"{MIN_MEAN_ALPHA}f")
 
-# Sum the moments of each splat over its bins, which have consecutive slots, and convert them to the gradient of the
-# splat's row. The order of the sum does not depend on the number of threads.
+# Sums the moments of each splat over its bins, which have consecutive slots, and converts them to the gradient of the
+# splat's row. The order of summation does not depend on the number of threads.
 _GRADIENT = r"""
 long slot = order.firsts.data[piece];
 for (int i = order.bounds.data[piece], end = order.bounds.data[piece + 1]; i < end; ++i) {
@@ -143,9 +144,10 @@ def _gradients(start: int, piece: int, order: SplatOrder, moments: wp.array2d[fl
 
 
 def composite_adjoint(splats: Tensor, bins: Bins, ends: Tensor, canvas: Canvas, upstream: ImageGradients) -> Tensor:
-    """Gradient (n, 16) of the splats.
+    """Return the gradient (n, 16) of the splats.
 
-    `ends` (bins,): index of the member at which each bin's forward pass stopped. `canvas`: as that pass left it.
+    `ends` (bins,) is the index of the member at which the forward pass of each bin stopped; `canvas` is in the state
+    after that pass.
     """
     bounds = bins.balanced_bounds(4 * num_threads(), ends - bins.starts[:-1])
     moments = torch.empty(len(bins.members), SPLAT_SIZE)

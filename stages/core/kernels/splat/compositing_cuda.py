@@ -1,8 +1,8 @@
-"""Front-to-back compositing of splats in tiles on CUDA, and its adjoint: a block of threads per tile.
+"""Front-to-back alpha compositing of splats in tiles on CUDA, and its adjoint: one thread block per tile.
 
-A warp draws 8 x 4 pixels. It skips splats whose box does not reach these pixels. The adjoint sums over the pixels of a
-tile by warp shuffles and shared memory, writes one row per slot, and then sums each splat's rows: no atomics, so the
-result does not depend on the order of execution.
+Each warp renders 8 x 4 pixels, and skips splats whose bounding box does not reach these pixels. The adjoint sums over
+the pixels of a tile by warp shuffles and shared memory, writes one row per slot, and then sums each splat's rows. It
+uses no atomics, so the result does not depend on the order of execution.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from stages.core.kernels.splat.tiles import SlotRanges, TiledSplats, Tiles
 wp.set_module_options({"enable_backward": False})
 
 THREADS = TILE_SIZE * TILE_SIZE
-MOMENTS = 12  # sums over pixels for each slot: see `_BACKWARD`
+MOMENTS = 12  # number of sums over pixels for each slot, see `_BACKWARD`
 
-# The thread's pixel and the test whether a splat at x, y with the box rx, ry reaches the pixels of its warp.
+# The thread's pixel, and a test whether a splat at x, y with bounding box half sizes rx, ry reaches its warp's pixels.
 _PIXEL = r"""
 const int t = threadIdx.x, warp = t >> 5, lane = t & 31;
 const int width = canvas.alpha.shape[1], height = canvas.alpha.shape[0], across = (width + 15) / 16;
@@ -39,7 +39,8 @@ auto reaches = [X, Y](float4 box) {
 };
 """
 
-# Shared copies of a batch: box (centre, half width and height), log2 alpha as a quadratic form, and colour.
+# Copies of a batch of splats in shared memory: box (centre, half width and height), log2 alpha as a quadratic form, and
+# colour.
 _LOAD = r"""
 __shared__ float4 box[BATCH], form[BATCH], colour[BATCH];
 auto load = [&](int at, int k) {
@@ -182,7 +183,7 @@ for (int top = last; top > begin; top -= 32) {
 #undef EXCHANGE
 """
 
-# Sum of a splat's slots, 16 threads a splat, and conversion to the gradient of its row.
+# Sums a splat's slots with 16 threads per splat, and converts the sums to the gradient of its row.
 _GRADIENT = r"""
 const int r = at / 16, c = at % 16, id = (int)order.ids.data[r];
 const int end = order.ends.data[r], to = end < moments.shape[0] ? end : moments.shape[0];
@@ -202,7 +203,7 @@ rows.grads.data[16 * (long long)id + c] = m;
 
 
 def _on_cuda(code: str, batch: int = 0) -> str:
-    """The snippet with its constants, compiled for CUDA only."""
+    """Insert constants into a snippet, and compile it for CUDA only."""
     constants = {"MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "MIN_MEAN_ALPHA": MIN_MEAN_ALPHA}
     for name, value in constants.items():
         code = code.replace(name, f"{value}f")
@@ -239,7 +240,7 @@ def _gradients(order: SlotRanges, moments: wp.array2d[float], rows: SplatGradien
 
 
 def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, inputs: list) -> None:
-    """Launch a kernel with a block of threads for each tile."""
+    """Launch a kernel with one thread block per tile."""
     count = THREADS * (len(tiles.starts) - 1)
     launch(kernel, count, [tiles.of(splats), *inputs], device=device_of(splats), block_dim=THREADS)
 
@@ -247,8 +248,11 @@ def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, inputs: list) -> No
 def draw(
     splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, Tensor], Tensor]:
-    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)); the transmittance (h * w,) left and the end of the list
-    (h * w,) of each pixel; and the splat with the largest weight in it (h, w; -1: none)."""
+    """Composite splats; arguments as for `compositing.composite`.
+
+    Returns the images (rgb (h, w, 3), fourth channel and alpha (h, w)), the state of each pixel (final transmittance
+    and position at which it was finished, both (h * w,)), and the splat with the largest weight (h, w; -1: none).
+    """
     new, size = splats.new_empty, (tiles.height, tiles.width)
     rgb, fourth, alpha, dominant = new(*size, 3), new(size), new(size), new(size, dtype=torch.int32)
     left, stops = new(alpha.numel()), new(alpha.numel(), dtype=torch.int32)
@@ -258,7 +262,7 @@ def draw(
 
 
 def draw_adjoint(splats: Tensor, tiles: Tiles, canvas: Canvas, upstream: ImageGradients) -> Tensor:
-    """Gradient (n, 16) of the splats. `canvas`: as `draw` left it."""
+    """Return the gradient (n, 16) of the splats; `canvas` is in the state after `draw`."""
     moments, grads = splats.new_empty(len(tiles.slots), MOMENTS), torch.empty_like(splats)
     _launch(_composite_adjoint, splats, tiles, [canvas, upstream, view(moments)])
     rows = with_arrays(SplatGradients(), {"splats": splats, "grads": grads})
@@ -267,9 +271,10 @@ def draw_adjoint(splats: Tensor, tiles: Tiles, canvas: Canvas, upstream: ImageGr
 
 
 def composite_with_dominant(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As `compositing.composite_with_dominant`, for splats and tiles on a CUDA device.
+    """`compositing.composite_with_dominant` for splats and tiles on a CUDA device.
 
-    A splat's total weight is the derivative of the sum over all pixels of a colour channel by the splat's colour.
+    The total weight of a splat is computed as the derivative of the sum of a colour channel over all pixels with
+    respect to the splat's colour.
     """
     behind = splats.new_zeros(3)
     (rgb, fourth, alpha), (left, stops), dominant = draw(splats, tiles, behind, True)

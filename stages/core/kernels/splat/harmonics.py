@@ -1,6 +1,6 @@
-"""C++ snippets: spherical harmonics, and for `projection` colour from them and its adjoint, 16 Gaussians at a time.
+"""Snippets for spherical harmonics: basis functions, and for `projection` view-dependent colour and its adjoint.
 
-Basis, order and signs as in stages/core/geometry/harmonics.py.
+Basis, order and signs are those of stages/core/geometry/harmonics.py.
 """
 
 _DIRECTION = r"""
@@ -26,7 +26,7 @@ if (k > 9) {
     Y[14] = 0.5f * k32 * h * (x * x - y * y); Y[15] = -k33 * x * (x * x - 3 * y * y);
 }
 """
-"""In: unit direction x, y, h and the number k of functions. Out: their values Y."""
+"""In: unit direction x, y, h and the number k of basis functions. Out: their values Y."""
 
 _COLOUR = r"""
 F rgb[3] = {(F)(0.5f), (F)(0.5f), (F)(0.5f)};
@@ -63,4 +63,4 @@ if (k > 9) {
            + 0.5f * k32 * (xx - yy) * vY[14];
 }
 """
-"""In: gradient of the colour, slots 6 to 8. Out: gradient of the coefficients, v_sh, and of the direction, vd."""
+"""In: gradient of the colour, in slots 6 to 8. Out: gradients of the coefficients, v_sh, and of the direction, vd."""

@@ -1,7 +1,7 @@
-"""Loss of a rendered photo (L1, SSIM and inverse depth) and its gradient: eight launches on CUDA instead of eighty.
+"""Photometric loss of a rendered photo (L1, SSIM and inverse depth) and its gradient.
 
-One thread per value applies the exposure, and one per pixel adds up the loss and its gradients. On a CPU, where
-launches cost little, the reference is used.
+Takes eight launches on CUDA instead of eighty: one thread per value applies the exposure, and one thread per pixel sums
+the loss and its gradients. On a CPU, where launches are cheap, the reference is used.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from stages.core.kernels.splat.ssim_pixel import ssim_backward, ssim_forward
 
 wp.set_module_options({"enable_backward": False})
 
-MIN_DEPTH_ALPHA = 0.5  # of pixels whose depth counts
+MIN_DEPTH_ALPHA = 0.5  # smallest alpha of pixels that contribute to the depth term
 
 
 @dataclass(frozen=True)
 class LossTerms:
-    """Weights and units of the terms."""
+    """Weights and units of the terms of the loss."""
 
-    ssim: float  # weight of 1 - SSIM; L1 has the rest
+    ssim: float  # weight of 1 - SSIM; the weight of L1 is 1 - ssim
     depth: float  # weight of the error in inverse depth [1 / camera distance]
     camera_distance: float  # unit of the depth term [scene units]
     min_depth: float  # rendered depth is clamped to this in the depth term [scene units]
 
 
 class PhotoTarget(NamedTuple):
-    """What a rendered photo is compared with."""
+    """The photo that a render is compared with, and its depth if known."""
 
     photo: UInt8[Tensor, "h w 3"]
-    inverse: Float[Tensor, "h w"] | None  # camera distance over depth, not finite where unknown; None: no depth
+    inverse: Float[Tensor, "h w"] | None  # camera distance / depth, not finite where unknown; None: no depth
 
 
 @wp.struct
@@ -52,12 +52,12 @@ class RenderedPhoto:
 
 @wp.struct
 class PhotoComparison:
-    """The exposed render beside the photo."""
+    """The render after exposure, the photo, and their similarity."""
 
     image: wp.array2d[float]  # (h, w * 3), rgb * gain
     photo: wp.array2d[float]  # (h, w * 3), 0..1
     ssim: wp.array2d[float]  # (h, w * 3)
-    ssim_grads: wp.array2d[float]  # (h, w * 3), of the mean by the image
+    ssim_grads: wp.array2d[float]  # (h, w * 3), gradient of the mean SSIM with respect to `image`
     inverse: wp.array2d[float]  # (h, w) as in `PhotoTarget`, empty without depth
 
 
@@ -85,7 +85,11 @@ def _add_up(
     terms: wp.vec4, render: RenderedPhoto, compared: PhotoComparison, v_rgb: wp.array2d[float],
     v_depth: wp.array2d[float], sums: wp.array3d[float],
 ):  # fmt: skip
-    """`terms` are the values of `LossTerms`; `sums` holds the loss of a pixel and its derivatives by the gains."""
+    """Compute the loss of each pixel and its gradients.
+
+    `terms` are the values of `LossTerms`; `sums` holds the loss of each pixel and its derivatives with respect to the
+    gains.
+    """
     i, j = wp.tid()
     ssim_weight, depth_weight, distance, min_depth = terms[0], terms[1], terms[2], terms[3]
     depth = render.depth[i, j]
@@ -140,9 +144,9 @@ def photometric_loss(
     rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], depth: Float[Tensor, "h w"], gain: Float[Tensor, "3"],
     target: PhotoTarget, terms: LossTerms,
 ) -> Float[Tensor, ""]:  # fmt: skip
-    """Loss of the image rgb * gain of a photo, and of its depth where the photo's is known.
+    """Return the loss of the image rgb * gain, and of its depth where the depth of the photo is known.
 
-    Differentiable in rgb, depth and gain; alpha only selects the pixels whose depth counts.
+    Differentiable in rgb, depth and gain; alpha only selects the pixels that contribute to the depth term.
     """
     if not rgb.is_cuda:
         return photometric_loss_reference(rgb, alpha, depth, gain, target, terms)

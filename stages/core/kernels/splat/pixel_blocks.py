@@ -1,14 +1,15 @@
 """The 64 blocks of 4 x 4 pixels of a bin, one SIMD vector each: shared by compositing and its adjoint.
 
-Compositing rule, as in gsplat: alpha = min(0.999, opacity exp(-d'Cd/2)) is skipped below 1/255, a pixel is finished
-when the next splat would reduce its transmittance T to 1e-4 or less (that splat is not drawn), the weight is alpha T.
+Compositing rule, as in gsplat: a splat has alpha = min(0.999, opacity exp(-d'Cd/2)) and weight alpha T, where T is the
+transmittance of the pixel; it is skipped if alpha is below 1/255. A pixel is finished when the next splat, which is not
+drawn, would reduce T to 1e-4 or less.
 """
 
 from stages.core.kernels.splat.projection import BIN_SIZE
 
-MAX_ALPHA = 0.999  # of a splat at a pixel, so that 1 / (1 - alpha) is finite
-MIN_TRANSMITTANCE = 1e-4  # a pixel is finished when the next splat would fall below it
-MIN_MEAN_ALPHA = 1e-10  # of a pixel, below which the weighted mean of the fourth channel is 0
+MAX_ALPHA = 0.999  # upper bound of a splat's alpha at a pixel, so that 1 / (1 - alpha) is finite
+MIN_TRANSMITTANCE = 1e-4  # a pixel is finished when the next splat would reduce its transmittance to this or less
+MIN_MEAN_ALPHA = 1e-10  # alpha of a pixel below which the weighted mean of the fourth channel is 0
 BLOCKS_PER_BIN = (BIN_SIZE // 4) ** 2
 PIXELS_PER_BIN = BLOCKS_PER_BIN * 16  # per-pixel state is stored by block, then by lane
 
@@ -40,7 +41,7 @@ auto overlapped = [&](float x, float y, float rx, float ry) -> unsigned long lon
     return columns & (~0ull << (8 * i0)) & (~0ull >> (56 - 8 * i1));
 };
 """
-"""C++: the list of a bin, pixel coordinates of the lanes of each block, and the blocks that a splat overlaps.
+"""C++: the list of a bin, the pixel coordinates of the lanes of each block, and the blocks that a splat overlaps.
 
-Uses the number `bin`, the `bins` (BinnedSplats) and the `canvas` of the kernel.
+Uses the index `bin`, the `bins` (BinnedSplats) and the `canvas` of the kernel.
 """

@@ -1,6 +1,7 @@
-"""Projection of Gaussians to one camera (EWA splatting) and its adjoint: 16 at a time on a CPU, one per thread on CUDA.
+"""Projection of Gaussians into one camera (EWA splatting) and its adjoint.
 
-A splat, a projected Gaussian, is a row of 16 floats, one cache line:
+Processes 16 Gaussians at a time on a CPU and one per thread on CUDA. A splat is a projected Gaussian, stored as a row
+of 16 floats, one cache line:
 0-1 centre [px], 2-4 inverse covariance xx xy yy [1/px^2], 5 opacity, 6-8 colour, 9 depth, 10 log2 of the opacity,
 11-12 half width and height [px] of the region with alpha >= 1/255 (0: not visible), 13-15 unused.
 """
@@ -34,15 +35,15 @@ BLUR = 0.3  # added to the image covariance [px^2], so that no splat is thinner 
 MIN_ALPHA = 1 / 255  # smaller contributions are skipped
 SPLAT_SIZE = 16  # floats in a splat
 BIN_SIZE = 32  # [px], side of a bin on a CPU
-TILE_SIZE = 16  # [px], side of a bin on CUDA: a thread per pixel, 256 in a block
+TILE_SIZE = 16  # [px], side of a bin on CUDA: one thread per pixel, 256 per block
 
 
 @wp.struct
 class GaussianArrays:
-    """The n Gaussians of a scene, or the gradients of the loss by them."""
+    """The n Gaussians of a scene, or the gradients of the loss with respect to them."""
 
     means: wp.array2d[float]  # (n, 3) [m]
-    quats: wp.array2d[float]  # (n, 4), w x y z of any length
+    quats: wp.array2d[float]  # (n, 4), w x y z of any norm
     scales: wp.array2d[float]  # (n, 3) [m]
     opacities: wp.array[float]  # (n,)
     sh: wp.array3d[float]  # (n, k, 3), k = (degree + 1)**2
@@ -50,22 +51,22 @@ class GaussianArrays:
 
 @wp.struct
 class ProjectedSplats:
-    """The splats of n Gaussians, and where binning finds them."""
+    """The splats of n Gaussians, with their sort keys and bins."""
 
     splats: wp.array2d[float]  # (n, 16)
-    keys: wp.array[int]  # (n,), bits of the depth, -1: not visible
-    rects: wp.array2d[wp.int16]  # (n, 4), first column and row and last ones of the bins
+    keys: wp.array[int]  # (n,), bits of the depth; -1: not visible
+    rects: wp.array2d[wp.int16]  # (n, 4), bins of each splat: first column, first row, last column, last row
 
 
 @wp.struct
 class SplatGradients:
-    """Splats and the gradients of the loss by them."""
+    """Splats and the gradients of the loss with respect to them."""
 
     splats: wp.array2d[float]  # (n, 16)
     grads: wp.array2d[float]  # (n, 16)
 
 
-# Rows of a group of Gaussians: 16 on a CPU, one on CUDA.
+# Row indices of a group of Gaussians: 16 on a CPU, one on CUDA.
 _ROWS = by_device(
     SCALARS
     + r"""
@@ -86,7 +87,7 @@ auto gather = [&row](const float* p, int stride, int column) {
 """,
 )
 
-# Out: covariance on the image and its inverse.
+# Out: image covariance and its inverse.
 _GEOMETRY = r"""
 const float *means = gaussians.means.data, *quats = gaussians.quats.data, *scales = gaussians.scales.data;
 const float *opacities = gaussians.opacities.data, *sh = gaussians.sh.data;
@@ -198,7 +199,7 @@ rect[3] = tile(py + ry - 0.5f, cam[20]);
 
 _WRITE = by_device(_WRITE_ONE, _WRITE_GROUP)
 
-# Rows of the gradients: `slot` reads a column of the splats' gradient, `scatter` writes one of a Gaussian's.
+# Access to gradients: `slot` reads a column of the splats' gradient, `scatter` writes a column of the Gaussians'.
 _ADJOINT_ROWS = by_device(
     r"""
 const F none = 0;
@@ -320,7 +321,7 @@ def _launch(kernel: wp.Kernel, means: Tensor, inputs: list) -> None:
 
 
 def _arrays(gaussians: Sequence[Tensor]) -> GaussianArrays:
-    """The tensors of `GaussianArrays`, in its order, for kernels."""
+    """Wrap tensors in the order of the fields of `GaussianArrays` for kernels."""
     return with_arrays(GaussianArrays(), dict(zip(GaussianArrays.vars, gaussians, strict=True)))
 
 
@@ -347,18 +348,18 @@ class _Project(torch.autograd.Function):
 
 
 def project(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
-    """Project Gaussians: splats (n, 16), sort keys (n,) and bin rectangles (n, 4: first column, first row, last ones).
+    """Project Gaussians; return splats (n, 16), sort keys (n,) and bin rectangles (n, 4).
 
-    `camera` is from `pack_camera`, on the device of the Gaussians. Bins have BIN_SIZE pixels on a CPU and TILE_SIZE on
-    CUDA. Only the splats are differentiable. Keys are the bits of the depth, -1 for Gaussians
-    that are not visible.
+    `camera` is from `pack_camera`, on the device of the Gaussians. Keys are the bits of the depth, -1 for Gaussians
+    that are not visible. A rectangle is the first column, first row, last column and last row of bins, which have
+    BIN_SIZE pixels on a CPU and TILE_SIZE on CUDA. Only the splats are differentiable.
     Source: Zwicker et al. 2001, "EWA splatting"; conventions of gsplat's classic mode.
     """
     return _Project.apply(camera, *(t.float().contiguous() for t in (means, quats, scales, opacities, sh)))
 
 
 def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
-    """Splats (n, 16) as `project` returns them, in PyTorch and any precision."""
+    """Return splats (n, 16) as `project` does, in PyTorch and any precision."""
     camera = camera.to(means)
     W, t, (fx, fy, cx, cy), centre = camera[:9].view(3, 3), camera[9:12], camera[12:16], camera[16:19]
     (width, height, near), limits = camera[19:22], camera[22:26]

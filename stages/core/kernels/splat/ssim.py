@@ -1,10 +1,11 @@
 """Structural similarity (SSIM) of two images and its gradient.
 
-Definition: Gaussian window of 11 x 11 pixels with sigma 1.5, weights that sum to 1; images are zero-padded by 5 pixels,
-and the mean is over all pixels and channels, as in the loss of 3D Gaussian splatting. `stages.evaluate.images.ssim`
-instead averages over the windows that lie inside the image (no padding), so the values of the two are not comparable.
+Definition: Gaussian window of 11 x 11 pixels with sigma 1.5 and weights that sum to 1; images are zero-padded by 5
+pixels, and the mean is over all pixels and channels, as in the loss of 3D Gaussian splatting.
+`stages.evaluate.images.ssim` instead averages over the windows that lie inside the image (no padding), so the values of
+the two are not comparable.
 
-The window is separable and the channels are interleaved, so both passes are sums of shifted rows: down the columns from
+The window is separable and the channels are interleaved, so both passes are sums of shifted rows: down the columns of
 the images into a scratch line, then along that line.
 """
 
@@ -22,7 +23,7 @@ from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS, 
 
 wp.set_module_options({"enable_backward": False})
 
-# Window down the columns at every element of row i, then along the row; COUNT maps at once.
+# Applies the window down the columns at every element of row i, then along the row; COUNT maps at once.
 _ROWS = r"""
 const float window[11] = {WINDOW};
 const float *first = images.first.data, *second = images.second.data;
@@ -55,7 +56,8 @@ auto clear = [&]() {
 };
 """.replace("WINDOW", ", ".join(f"{weight!r}f" for weight in WINDOW))
 
-# Means, variances and covariance; then SSIM and its derivatives by mean and variance of the first image and covariance.
+# Computes means, variances and covariance, then SSIM and its derivatives with respect to the mean and variance of the
+# first image and to the covariance.
 _FORWARD = r"""
 for (int j = 0; j < size; j += 16) {
     F sum[5];
@@ -89,7 +91,7 @@ for (int j = 0; j < size; j += 16) {
 totals.data[i] = total;
 """.replace("C1", f"{C1}f").replace("C2", f"{C2}f")
 
-# Chain rule to the first image: d mean = window, d variance = 2 x, d covariance = y.
+# Chain rule to the first image, with a window weight w: d mean = w, d variance = 2 w x, d covariance = w y.
 _BACKWARD = r"""
 const long all = (long)height * size;
 for (int j = 0; j < size; j += 16)
@@ -140,7 +142,10 @@ def _gradient(
 
 
 def _forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean SSIM, and the derivatives (3, h, w, c) by mean and variance of the first image and by the covariance."""
+    """Return the mean SSIM, and the derivatives (3, h, w, c) of the SSIM.
+
+    Derivatives are with respect to the mean and variance of the first image, and to the covariance.
+    """
     derivatives = torch.empty(3, *first.shape)
     totals = torch.empty(len(first), dtype=torch.float64)
     _launch(_similarity, first, second, 5, derivatives, totals)
@@ -148,7 +153,7 @@ def _forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:
-    """Gradient of the mean SSIM by the first image."""
+    """Return the gradient of the mean SSIM with respect to the first image."""
     grads = torch.empty_like(first)
     _launch(_gradient, first, second, 3, derivatives, grads)
     return grads / first.numel()
@@ -163,12 +168,12 @@ def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *output
 
 
 def _passes(image: Tensor):
-    """Forward and backward pass for the image's device."""
+    """Return the forward and backward pass for the device of an image."""
     return (_pixel_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_forward, _backward)
 
 
 def _pixel_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """As `_forward`; the derivatives are in the order of `ssim_pixel`."""
+    """`_forward` on CUDA; the derivatives have the layout of `ssim_pixel`."""
     ssim_map, derivatives = ssim_pixel.ssim_forward(first, second)
     return ssim_map.mean(), derivatives
 
@@ -190,7 +195,7 @@ class _Ssim(torch.autograd.Function):
 
 
 def ssim(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Mean structural similarity of two images with values in 0..1, zero-padded; at most 1. Differentiable in both.
+    """Mean structural similarity of two images with values in 0..1, zero-padded; differentiable in both, at most 1.
 
     Raises ValueError if the shapes differ.
     Source: Wang et al. 2004, "Image quality assessment", eq. 13, with K1 = 0.01, K2 = 0.03.

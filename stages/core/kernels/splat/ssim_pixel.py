@@ -1,7 +1,7 @@
-"""Structural similarity (SSIM) and its gradient with one thread per value: used on CUDA, tested on any device.
+"""Structural similarity (SSIM) and its gradient with one thread per value; used on CUDA, tested on any device.
 
-Definition as in `ssim` (zero padding). Value and gradient take two launches each: the window is applied down the
-columns into scratch maps, then along the rows.
+Definition as in `ssim` (zero padding). Value and gradient take two launches each: one applies the window down the
+columns into scratch maps, the other along the rows.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ taps = wp.types.vector(TAPS, wp.float32)
 
 @wp.struct
 class ImagePair:
-    """Two images of the same size that are compared, the channels of a pixel side by side."""
+    """Two images of the same size to compare, with interleaved channels."""
 
     first: wp.array2d[float]  # (h, w * c)
     second: wp.array2d[float]  # (h, w * c)
@@ -38,7 +38,7 @@ class ImagePair:
 
 
 def image_pair(first: Tensor, second: Tensor) -> ImagePair:
-    """Images (h, w, c) for kernels."""
+    """Wrap two images (h, w, c) for kernels."""
     images = with_arrays(ImagePair(), {"first": first.flatten(1), "second": second.flatten(1)})
     images.channels = first.shape[2]
     return images
@@ -46,7 +46,7 @@ def image_pair(first: Tensor, second: Tensor) -> ImagePair:
 
 @wp.kernel
 def _down(window: taps, images: ImagePair, sums: wp.array2d[maps5]):
-    """Window down the columns of both images, their squares and their product."""
+    """Apply the window down the columns of both images, their squares and their product."""
     i, j = wp.tid()
     total = maps5()
     for t in range(wp.static(TAPS)):
@@ -62,7 +62,10 @@ def _down(window: taps, images: ImagePair, sums: wp.array2d[maps5]):
 def _compare(
     window: taps, channels: int, sums: wp.array2d[maps5], ssim_map: wp.array2d[float], derivatives: wp.array2d[wp.vec3]
 ):  # fmt: skip
-    """Window along the rows; SSIM and its derivatives by the first image's mean and variance and by the covariance."""
+    """Apply the window along the rows; compute SSIM and its derivatives.
+
+    Derivatives are with respect to the mean and variance of the first image, and to the covariance.
+    """
     i, j = wp.tid()
     e = maps5()
     for t in range(wp.static(TAPS)):
@@ -82,7 +85,7 @@ def _compare(
 
 @wp.kernel
 def _down_derivatives(window: taps, derivatives: wp.array2d[wp.vec3], sums: wp.array2d[wp.vec3]):
-    """Window down the columns of the three derivatives."""
+    """Apply the window down the columns of the three derivatives."""
     i, j = wp.tid()
     total = wp.vec3()
     for t in range(wp.static(TAPS)):
@@ -96,7 +99,10 @@ def _down_derivatives(window: taps, derivatives: wp.array2d[wp.vec3], sums: wp.a
 def _gather(
     window: taps, factor: float, images: ImagePair, sums: wp.array2d[wp.vec3], grads: wp.array2d[float]
 ):  # fmt: skip
-    """Window along the rows; chain rule to the first image: d mean = window, d variance = 2 x, d covariance = y."""
+    """Apply the window along the rows, and the chain rule to the first image.
+
+    With a window weight w and pixel values x and y: d mean = w, d variance = 2 w x, d covariance = w y.
+    """
     i, j = wp.tid()
     e = wp.vec3()
     for t in range(wp.static(TAPS)):
@@ -107,8 +113,10 @@ def _gather(
 
 
 def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """SSIM map (h, w * c) of images (h, w, c), and its derivatives (h, w * c, 3) by the first image's mean and variance
-    and by the covariance."""
+    """Return the SSIM map (h, w * c) of images (h, w, c), and its derivatives (h, w * c, 3).
+
+    Derivatives are with respect to the mean and variance of the first image, and to the covariance.
+    """
     x = first.flatten(1)
     sums, ssim_map, derivatives = x.new_empty(*x.shape, 5), torch.empty_like(x), x.new_empty(*x.shape, 3)
     launch(_down, x.shape, [taps(WINDOW), image_pair(first, second)], [view(sums, maps5)], device_of(x))
@@ -118,7 +126,10 @@ def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def ssim_backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:
-    """Gradient (h, w, c) of the mean SSIM by the first image; `derivatives` as `ssim_forward` returns them."""
+    """Return the gradient (h, w, c) of the mean SSIM with respect to the first image.
+
+    `derivatives` are those returned by `ssim_forward`.
+    """
     x = first.flatten(1)
     sums, grads = torch.empty_like(derivatives), torch.empty_like(x)
     launch(_down_derivatives, x.shape, [taps(WINDOW), view(derivatives, wp.vec3)], [view(sums, wp.vec3)], device_of(x))

@@ -1,10 +1,10 @@
-"""Binning on CUDA: the splats that overlap each tile of TILE_SIZE x TILE_SIZE pixels, sorted by depth.
+"""Binning on CUDA: lists of the splats that overlap each tile of TILE_SIZE x TILE_SIZE pixels, sorted by depth.
 
 The splats are sorted by depth, listed in that order once for every tile that they overlap, and the list is sorted by
-tile; both sorts are stable. An entry of the unsorted list is called a slot: the slots of a splat are contiguous, so
-that the adjoint sums a splat's gradient over its tiles in a fixed order, without atomics.
+tile; both sorts are stable. An entry of the unsorted list is called a slot. The slots of a splat are contiguous, so the
+adjoint sums a splat's gradient over its tiles in a fixed order, without atomics.
 
-With a given capacity nothing waits for the GPU, so the functions can be captured in a CUDA graph.
+With a given capacity the functions do not synchronise with the GPU, so they can be captured in a CUDA graph.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ MAX_INT16 = 2**15 - 1
 
 @wp.struct
 class SlotRanges:
-    """The splats by depth and the slots of each: ends[r] - counts[r] up to ends[r]."""
+    """The splats in order of depth, and the range of slots of each: ends[r] - counts[r] up to ends[r]."""
 
     ids: wp.array[wp.int64]  # (n,)
     counts: wp.array[int]  # (n,)
-    ends: wp.array[int]  # (n,); may exceed the number of slots if the capacity was too small
+    ends: wp.array[int]  # (n,); may exceed the number of slots if the capacity is too small
 
 
 @wp.struct
 class TiledSplats:
-    """Splats and the lists of those in each tile; see `Tiles`."""
+    """Splats and the lists of the splats in each tile; see `Tiles`."""
 
     splats: wp.array2d[float]  # (n, 16)
     slots: wp.array[wp.int64]  # (m,)
@@ -71,7 +71,7 @@ def _fill(
 
 @wp.kernel
 def _starts(tiles: wp.array[wp.int32], starts: wp.array[int]):
-    """Position of the first entry of each tile in the sorted list; entries of tile -1 are unused capacity."""
+    """Find the first entry of each tile in the sorted list; entries of tile -1 are unused capacity."""
     k = wp.tid()
     tile = tiles[k]
     before = wp.int32(-1)
@@ -86,14 +86,14 @@ def _starts(tiles: wp.array[wp.int32], starts: wp.array[int]):
 
 @dataclass(frozen=True)
 class Capacity:
-    """Room for the slots of repeated calls that must not wait for the GPU."""
+    """Fixed number of slots, for repeated calls that must not synchronise with the GPU."""
 
     slots: int
-    needed: Tensor  # (1,) int32: the most slots that any call needed
+    needed: Tensor  # (1,) int32, the largest number of slots that any call needed
 
     @classmethod
     def at_least(cls, needed: int, device: torch.device) -> Capacity:
-        """A capacity of 1.5 times the `needed` slots and some more, since later calls may need more."""
+        """Return a capacity of 1.5 times the `needed` slots plus a constant, since later calls may need more."""
         return cls(needed + needed // 2 + 1024, torch.zeros(1, dtype=torch.int32, device=device))
 
 
@@ -101,7 +101,7 @@ class Capacity:
 class Tiles:
     """The splats of each tile, nearest first; tiles are numbered row by row. m is the number of slots."""
 
-    slots: Tensor  # (m,) int64: tile b holds slots[starts[b]:starts[b + 1]]
+    slots: Tensor  # (m,) int64, tile b holds slots[starts[b]:starts[b + 1]]
     ids: Tensor  # (m,) int32, splat of each slot
     starts: Tensor  # (tiles + 1,) int32
     order: SlotRanges
@@ -109,16 +109,16 @@ class Tiles:
     height: int
 
     def of(self, splats: Tensor) -> TiledSplats:
-        """These tiles of splats (n, 16) for kernels."""
+        """Return the tiles with their splats (n, 16) for kernels."""
         tiled = with_arrays(TiledSplats(), {"splats": splats, "ids": self.ids, "starts": self.starts})
         tiled.slots = view(self.slots)
         return tiled
 
 
 def bin_tiles(keys: Tensor, rects: Tensor, width: int, height: int, capacity: Capacity | None = None) -> Tiles:
-    """Sort splats into tiles, by sort keys (n,) and tile rectangles (n, 4) as `project` returns them.
+    """Sort splats into tiles, given the sort keys (n,) and tile rectangles (n, 4) from `project`.
 
-    There are as many slots as needed or, with a capacity, as many as that has: those beyond it are dropped.
+    Without a capacity there are as many slots as needed; otherwise slots beyond the capacity are dropped.
     """
     device, n = keys.device, len(keys)
     across, down = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
@@ -136,7 +136,7 @@ def bin_tiles(keys: Tensor, rects: Tensor, width: int, height: int, capacity: Ca
     ranges = with_arrays(SlotRanges(), {"counts": counts, "ends": ends})
     ranges.ids = view(order)
     launch(_fill, n, [ranges, view(rects), across], [view(tiles), view(ids)], device_of(keys))
-    # a narrow key takes fewer passes of the radix sort
+    # a narrower key needs fewer passes of the radix sort
     narrow = tiles.to(torch.int16) if across * down <= MAX_INT16 else tiles
     tiles, slots = narrow.sort(stable=True)
     starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)

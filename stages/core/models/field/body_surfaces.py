@@ -1,8 +1,8 @@
-"""Surfaces of the bodies of a scene for contacts: signed distances on grids, and samples.
+"""Surfaces of the bodies of a scene for contact: signed distance grids and surface samples.
 
-A body's grid is in its frame, undeformed.
-Source: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
-contact".
+The grid of a body is in its body frame and of the undeformed shape.
+Source: point contacts in signed distance fields, Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based
+distributed contact".
 """
 
 from __future__ import annotations
@@ -16,63 +16,66 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-CORNERS = torch.tensor(list(product((0, 1), repeat=3)))  # of a cell
+CORNERS = torch.tensor(list(product((0, 1), repeat=3)))  # corners of a grid cell
 
 
 @dataclass(frozen=True)
 class BodyGrid:
-    """Depths of one body below its surface at the nodes of a grid in its frame [m]."""
+    """Depth grid of one body in its frame, with surface samples [m].
 
-    depth: Float[Tensor, "x y z"]
-    smooth: Float[Tensor, "x y z"]  # the same blurred, for directions
-    keypoint: Int[Tensor, "x y z"]  # nearest one
-    low: Float[Tensor, "3"]  # the first node
-    spacing: float
-    samples: Float[Tensor, "k 3"]  # points on the surface in the body's frame
-    normals: Float[Tensor, "k 3"]  # there, outwards
-    near: Int[Tensor, "k"]  # keypoint near each
-    point: Int[Tensor, "k"]  # which of the following points each is
-    flatness: Float[Tensor, "p"]  # of the surface at points: 1 in a plane and 0 at an edge
-    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
+    `samples` are k of the p surface points for which `flatness` and `faces` are given.
+    """
+
+    depth: Float[Tensor, "x y z"]  # depth below the surface at the nodes, negative outside
+    smooth: Float[Tensor, "x y z"]  # blurred depth, whose gradient gives directions
+    keypoint: Int[Tensor, "x y z"]  # keypoint nearest to each node
+    low: Float[Tensor, "3"]  # position of the first node
+    spacing: float  # distance between nodes
+    samples: Float[Tensor, "k 3"]  # points on the surface
+    normals: Float[Tensor, "k 3"]  # outward normals at the samples
+    near: Int[Tensor, "k"]  # keypoint nearest to each sample
+    point: Int[Tensor, "k"]  # index of each sample among the p points
+    flatness: Float[Tensor, "p"]  # of the surface at each point: 1 in a plane, 0 at an edge
+    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet at each point; unused rows are 0
     nearest: Int[Tensor, "x y z"]  # point nearest to each node; -1 far from the surface
-    ball: tuple[Float[Tensor, "3"], float] | None = None  # its centre and radius, if the body is one
-    # the centre, the axis and radius and half the height, if the body is a solid cylinder
+    ball: tuple[Float[Tensor, "3"], float] | None = None  # centre and radius, if the body is a ball
+    # centre, axis, radius and half the height, if the body is a solid cylinder
     cylinder: tuple[Float[Tensor, "3"], Float[Tensor, "3"], float, float] | None = None
-    hull: Float[Tensor, "f 4"] = torch.zeros(0, 4)  # normals and offsets of its faces, if it is convex
+    hull: Float[Tensor, "f 4"] = torch.zeros(0, 4)  # normals and offsets of the faces, if the body is convex
 
 
 @dataclass(frozen=True)
 class BodySurfaces:
-    """The grids of all bodies one after the other, and their samples, padded."""
+    """BodyGrid of all bodies: nodes, points and faces concatenated, samples padded to k."""
 
     depth: Float[Tensor, "g"]
     smooth: Float[Tensor, "g"]
     keypoint: Int[Tensor, "g"]
     first: Int[Tensor, "o"]  # row of each body's first node
-    shape: Int[Tensor, "o 3"]
+    shape: Int[Tensor, "o 3"]  # nodes along each axis
     low: Float[Tensor, "o 3"]
     spacing: Float[Tensor, "o"]
-    near: Int[Tensor, "o k"]  # keypoint near each sample; -1 where padded
+    near: Int[Tensor, "o k"]  # keypoint nearest to each sample; -1 where padded
     samples: Float[Tensor, "o k 3"]  # points on the surface in the body's frame [m]
-    normals: Float[Tensor, "o k 3"]  # outwards
-    point: Int[Tensor, "o k"]  # which of the following points each is
-    flatness: Float[Tensor, "p"]  # of the surfaces at points: 1 in a plane and 0 at an edge
-    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet there, the others 0
+    normals: Float[Tensor, "o k 3"]  # outward normals at the samples
+    point: Int[Tensor, "o k"]  # index of each sample among the p points
+    flatness: Float[Tensor, "p"]  # of the surface at each point: 1 in a plane, 0 at an edge
+    faces: Float[Tensor, "p 3 3"]  # normals of up to three faces that meet at each point; unused rows are 0
     nearest: Int[Tensor, "g"]  # point nearest to each node; -1 far from the surface
-    centre: Float[Tensor, "o 3"]  # of a ball or a solid cylinder
-    radius: Float[Tensor, "o"]  # of a ball; 0 for other bodies
-    axis: Float[Tensor, "o 3"]  # of a solid cylinder
+    centre: Float[Tensor, "o 3"]  # centre of a ball or a solid cylinder
+    radius: Float[Tensor, "o"]  # radius of a ball; 0 for other bodies
+    axis: Float[Tensor, "o 3"]  # axis of a solid cylinder
     side: Float[Tensor, "o"]  # radius of a solid cylinder; 0 for other bodies
-    half: Float[Tensor, "o"]  # half its height
+    half: Float[Tensor, "o"]  # half the height of a solid cylinder
     hull: Float[Tensor, "h 4"]  # normals and offsets of the faces of convex bodies [1, m]
     hull_first: Int[Tensor, "o"]  # row of each body's first face
-    hull_faces: Int[Tensor, "o"]  # number of faces; 0 of bodies that are not convex
-    reach: Float[Tensor, "o"]  # of the samples about the centre of mass [m]
-    overlap: Float[Tensor, "o o"]  # of each body with another at the start, which is no contact [m]
+    hull_faces: Int[Tensor, "o"]  # number of faces of each body; 0 if it is not convex
+    reach: Float[Tensor, "o"]  # largest distance of a sample from the centre of mass [m]
+    overlap: Float[Tensor, "o o"]  # initial penetration depth of each pair of bodies, which gaps disregard [m]
 
     @classmethod
     def of(cls, grids: Sequence[BodyGrid]) -> BodySurfaces:
-        """The surfaces of bodies; without overlaps."""
+        """Combine the grids of all bodies, with zero `overlap`."""
         sizes = torch.tensor([g.depth.numel() for g in grids])
         flat = {n: torch.cat([getattr(g, n).flatten() for g in grids]) for n in ("depth", "smooth", "keypoint")}
         at, normals, near, point = (
@@ -103,15 +106,15 @@ class BodySurfaces:
         )  # fmt: skip
 
     def to(self, device: torch.device | str) -> BodySurfaces:
-        """A copy on another device."""
+        """Return a copy on another device."""
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     def look_up(
         self, body: Int[Tensor, "r"], x: Float[Tensor, "r 3"]
     ) -> tuple[Float[Tensor, "r"], Float[Tensor, "r 3"]]:
-        """Depths of points x [m], in the frames of bodies, below their surfaces, and directions of steepest increase.
+        """Return depths [m] of points x below the surfaces of bodies, and the directions of their steepest increase.
 
-        Depths are negative outside; beyond the grid they are upper bounds.
+        Points are in the frames of the bodies [m]. Depths are negative outside; beyond the grid they are upper bounds.
         """
         h, shape = self.spacing[body, None], self.shape[body]
         place = (x - self.low[body]) / h
@@ -122,7 +125,8 @@ class BodySurfaces:
         row = self._row(body[:, None], cell[:, None] + corner)
         side = torch.where(corner.bool(), f[:, None], 1 - f[:, None])  # r 8 3
         depth = (self.depth[row] * side.prod(-1)).sum(-1)
-        # the body is in the box of its grid, so the angle at the nearest point of the box is at least a right one
+        # The body lies within the box of its grid, so the angle at the nearest point of the box is at least a right
+        # angle, and Pythagoras gives an upper bound of the (negative) depth.
         beyond = ((place - within) * h).square().sum(-1)
         depth = torch.where(beyond > 0, -(beyond + depth.clamp_max(0).square()).sqrt(), depth)
         sign = (2 * corner - 1).to(x)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from stages.core.models.field.equivariant import apply_layers, mlp, weighted_sum
 
 CONTACT_SATURATION = 2e-3  # mass fraction in contact at which a message has half its weight; hand-chosen, no source
-ACCELERATION_UNIT = 20.0  # acceleration that a network output of 1 times a unit vector stands for [m/s^2]
+ACCELERATION_UNIT = 20.0  # acceleration represented by a network output of 1 times a unit vector [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class ContactNet(nn.Module):
         self, contacts: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
-        """Message and weight of each contact point, and the weighted mean of the messages per object and partner.
+        """Return message and weight of each contact point, and the weighted mean message per object and partner.
 
         `mass_fraction` is that of each point; `own` and `other` are the embeddings of the object and of its partners.
-        Weights sum to almost 1 in firm contact and go to 0 with the gates, so that neither the number of keypoints nor
-        a point at the cutoff distance matters.
+        Weights sum to almost 1 in firm contact and go to 0 with the gates, so results depend neither on the number of
+        keypoints nor on points at the cutoff distance.
         """
         embedding_term = self.own_projection(own)[:, :, None, None]
         if self.partner_projection is not None:
@@ -75,7 +75,7 @@ class ContactNet(nn.Module):
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
-        """Acceleration of the object by each contact point, times its weight [m/s^2]."""
+        """Return the acceleration of the object due to each contact point, times the point's weight [m/s^2]."""
         context_term = self.context_projection(context)[:, :, :, None]
         return at_contacts(weight > 0, self._force, message, context_term, vectors, weight[..., None])
 
@@ -90,9 +90,9 @@ class ContactNet(nn.Module):
 def at_contacts(
     needed: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *inputs: Tensor
 ) -> Float[Tensor, "b o m n _"]:
-    """f of the rows of `inputs`, computed only where `needed`: a CPU gathers those rows and leaves 0 elsewhere.
+    """Apply f to the rows of `inputs`, on a CPU only to those `needed`, with 0 in the other rows.
 
-    A GPU evaluates all rows: gathering would make the host wait for their count.
+    On a GPU all rows are evaluated: gathering would make the host wait for their count.
     """
     if needed.is_cuda or torch.compiler.is_compiling():
         return f(*inputs, needed=needed)

@@ -16,10 +16,12 @@ from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.field.rest_shape import RestShape
 
-# Distances count now or, extrapolated linearly, one frame ahead, whichever is smaller. Hand-chosen, no source.
-FULL_CONTACT, NO_CONTACT = 0.04, 0.1  # the gate is 1 below the first and 0 above the second [m]
-SEARCH_RADIUS = 0.2  # farther points are never paired [m]; at 5 m/s a point within it is in contact one frame later
-PAIR_FRACTION, WALL_FRACTION = 0.375, 0.125  # of an object's keypoints, at most in contact with another or with walls
+# Distances are the smaller of the current one and the one extrapolated linearly to one FRAME ahead. The constants are
+# hand-chosen, without a source.
+FULL_CONTACT, NO_CONTACT = 0.04, 0.1  # the gate is 1 below the first and 0 above the second distance [m]
+# Points farther apart than this are never paired [m]; at 5 m/s a point this far is within NO_CONTACT one FRAME later.
+SEARCH_RADIUS = 0.2
+PAIR_FRACTION, WALL_FRACTION = 0.375, 0.125  # largest fraction of keypoints in contact with another object, with walls
 GAP_UNIT = 0.05  # network inputs: unit of distances [m]
 ARM_UNIT = 0.3  # network inputs: unit of offsets from the centre of mass [m]
 
@@ -28,7 +30,7 @@ class BodyKinematics(NamedTuple):
     """Kinematics of the bodies and their keypoints in world coordinates."""
 
     R: Float[Tensor, "b o 3 3"]
-    inverse: Float[Tensor, "b o 3 3"]  # of the inertia tensor per unit of mass [1/m^2]
+    inverse: Float[Tensor, "b o 3 3"]  # inverse of the inertia tensor per unit of mass [1/m^2]
     spin: Float[Tensor, "b o 3"]  # angular velocity [rad/s]
     com: Float[Tensor, "b o 3"]  # centre of mass [m]
     velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
@@ -39,39 +41,40 @@ class BodyKinematics(NamedTuple):
 
 
 class PairRows(NamedTuple):
-    """What the features of contacts of two bodies are made of, a row for each contact."""
+    """Inputs for the features of contacts between two bodies, one row per contact."""
 
-    own: Int[Tensor, "*#r"]  # keypoint, through all objects
-    partner: Int[Tensor, "*#r"]
-    difference: Float[Tensor, "*#r 6"]  # of their positions [m] and velocities [m/s]
-    distances: Float[Tensor, "*#r 3"]  # now, a frame ahead, and the gate
-    inverse: Float[Tensor, "*#r 3 3"]  # inertia of the body, as in BodyKinematics
-    other_inverse: Float[Tensor, "*#r 3 3"]  # that of the partner
-    ratio: Float[Tensor, "*#r"]  # mass of the partner over that of both
-    relative: Float[Tensor, "*#r 3"]  # velocity of the bodies [m/s]
-    gravity: Float[Tensor, "*#r 3"]
-    sizes: Float[Tensor, "*#r 2"]  # of both bodies, logarithms
+    own: Int[Tensor, "*#r"]  # keypoint of the body, counted over all objects
+    partner: Int[Tensor, "*#r"]  # keypoint of the partner, counted over all objects
+    difference: Float[Tensor, "*#r 6"]  # of the keypoints' positions [m] and velocities [m/s]
+    distances: Float[Tensor, "*#r 3"]  # distance now and one FRAME ahead [GAP_UNIT], and the gate
+    inverse: Float[Tensor, "*#r 3 3"]  # inverse inertia of the body, as in BodyKinematics
+    other_inverse: Float[Tensor, "*#r 3 3"]  # inverse inertia of the partner
+    ratio: Float[Tensor, "*#r"]  # mass of the partner over the mass of both
+    relative: Float[Tensor, "*#r 3"]  # relative velocity of the bodies [m/s]
+    gravity: Float[Tensor, "*#r 3"]  # [5 m/s^2]
+    sizes: Float[Tensor, "*#r 2"]  # logarithms of the sizes of both bodies
 
 
 class PlaneRows(NamedTuple):
-    """What the features of contacts with planes are made of, a row for each contact."""
+    """Inputs for the features of contacts with planes, one row per contact."""
 
-    state: Float[Tensor, "*#r 11"]  # of the keypoint: velocity, normal, arm, spacing, and whether it is one
-    normal: Float[Tensor, "*#r 3"]  # of the plane
-    distances: Float[Tensor, "*#r 3"]  # now, a frame ahead, and the gate
-    inverse: Float[Tensor, "*#r 3 3"]  # inertia of the body, as in BodyKinematics
-    velocity: Float[Tensor, "*#r 3"]  # of the body [m/s]
-    gravity: Float[Tensor, "*#r 3"]
-    size: Float[Tensor, "*#r 1"]  # of the body, logarithm
+    state: Float[Tensor, "*#r 11"]  # of the keypoint: velocity, normal, arm, spacing, and whether it is valid
+    normal: Float[Tensor, "*#r 3"]  # normal of the plane
+    distances: Float[Tensor, "*#r 3"]  # distance now and one FRAME ahead [GAP_UNIT], and the gate
+    inverse: Float[Tensor, "*#r 3 3"]  # inverse inertia of the body, as in BodyKinematics
+    velocity: Float[Tensor, "*#r 3"]  # velocity of the body [m/s]
+    gravity: Float[Tensor, "*#r 3"]  # [5 m/s^2]
+    size: Float[Tensor, "*#r 1"]  # logarithm of the size of the body
 
 
 def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
-    """Contacts of every object with every other one: its nearest keypoints, each with the nearest of the other's.
+    """Find the contacts of every object with every other one, and compute their features.
 
-    At most PAIR_FRACTION of an object's keypoints, those nearest now or a frame ahead, are contact points with one
-    partner. Vectors, in this order: gap (from the partner's point, in GAP_UNIT), normals of both, relative velocity of
-    the points, arms of both (in ARM_UNIT), relative velocity of the bodies, gravity, and the impulses per reduced mass
-    that would stop the relative velocity and that act along the partner's normal.
+    The contact points with a partner are at most PAIR_FRACTION of an object's keypoints, those closest to the partner
+    now or one FRAME ahead, each paired with the partner's nearest keypoint. Vectors, in this order: gap (from the
+    partner's point, in GAP_UNIT), normals of both, relative velocity of the points, arms of both (in ARM_UNIT),
+    relative velocity of the bodies, gravity, and the impulses per reduced mass that (up to sign) cancel the relative
+    velocity and that give a unit velocity along the partner's normal.
     """
     w, others = shape.initial, shape.others
     own, partner, distance = _nearest_pairs(shape, bodies)
@@ -92,7 +95,7 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     state = torch.cat([bodies.normal, bodies.arm, shape.spacing[..., None]], -1).flatten(0, 2)
 
     def features(*inputs: Tensor, needed: Tensor | None = None) -> Tensor:
-        """Vectors, one after the other, and scalars."""
+        """Concatenated vectors and scalars."""
         x = PairRows(*inputs)
         gap, approach = x.difference.split(3, -1)
         own_normal, own_arm, own_spacing = _rows(state, x.own).split([3, 3, 1], -1)
@@ -116,16 +119,16 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
 
 
 def _rows(x: Float[Tensor, "n c"], index: Int[Tensor, "*p"]) -> Float[Tensor, "*p c"]:
-    """Rows of x; unlike that of `x[index]`, the gradient needs no sorting."""
+    """Rows of x; its gradient needs no sorting, unlike the gradient of `x[index]`."""
     return x.index_select(0, index.flatten()).reshape(*index.shape, x.shape[1])
 
 
 def _nearest_pairs(
     shape: RestShape, bodies: BodyKinematics
 ) -> tuple[Int[Tensor, "b o m k"], Int[Tensor, "b o m k"], Float[Tensor, "b o m k"]]:
-    """Keypoints of each object near each partner, the partner's nearest ones, and their distances [m].
+    """Return keypoints of each object near each partner, the partner's keypoints nearest to them, and distances [m].
 
-    The second are counted through all objects of the batch; distances are infinite where there is no contact.
+    The partner's keypoints are counted over all objects of the batch. Distances are infinite where there is no contact.
     """
     w, others = shape.initial, shape.others
     distance, index = nearest(bodies.points, w.valid, SEARCH_RADIUS)
@@ -154,7 +157,7 @@ def _impulse_response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b
 
 
 def floor_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
-    """Contacts of every keypoint with the floor, however deep it is."""
+    """Contacts of every keypoint with the floor, at any depth."""
     height = bodies.points[..., 2] - shape.initial.floor[..., None]
     up = torch.eye(3, dtype=height.dtype, device=height.device)[2].expand_as(bodies.points)
     row = torch.arange(height.shape[2], device=height.device).expand_as(height)
@@ -162,7 +165,7 @@ def floor_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
 
 
 def wall_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
-    """Contacts of the keypoints nearest to walls or ceiling (at most WALL_FRACTION), each with the nearest plane."""
+    """Contacts of the keypoints nearest to walls or ceiling (at most WALL_FRACTION), each with its nearest plane."""
     w, x, count = shape.initial, bodies.points, math.ceil(WALL_FRACTION * bodies.points.shape[2])
     low, high = w.box[..., None, 0, :], w.box[..., None, 1, :]
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
@@ -180,12 +183,12 @@ def wall_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
 
 
 def _beyond(row: Int[Tensor, "*p k"], fraction: float, valid: Bool[Tensor, "b o n"]) -> Bool[Tensor, "b o k"]:
-    """Slots past an object's own maximum; they exist because another object of the batch has more keypoints."""
+    """Mask of slots beyond an object's own limit; they exist because another object of the batch has more keypoints."""
     return torch.arange(row.shape[-1], device=row.device) >= (fraction * valid.sum(-1, keepdim=True)).ceil()
 
 
 def _gather_own(x: Float[Tensor, "b o n c"], row: Int[Tensor, "b o k"]) -> Float[Tensor, "b o k c"]:
-    """Values at keypoints, counted within each object."""
+    """Values at keypoints `row`, counted within each object."""
     return x.gather(2, row[..., None].expand(*row.shape, x.shape[-1]))
 
 
@@ -193,10 +196,11 @@ def _plane_contacts(
     shape: RestShape, bodies: BodyKinematics, row: Int[Tensor, "b o k"], height: Float[Tensor, "b o k"],
     normal: Float[Tensor, "b o k 3"],
 ) -> ContactPoints:  # fmt: skip
-    """Contacts of keypoints `row` that are `height` [m] above a plane with that normal.
+    """Contacts of keypoints `row` that are `height` [m] above a plane with this normal, and their features.
 
     Vectors, in this order: plane normal, keypoint normal, velocity of the point, arm (in ARM_UNIT), velocity of the
-    body, gravity, and the impulses per mass that would stop the point and that act along the plane's normal.
+    body, gravity, and the impulses per mass that (up to sign) stop the point and that give it a unit velocity along
+    the plane's normal.
     """
     w = shape.initial
     state = [bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None], w.valid[..., None]]
@@ -206,7 +210,7 @@ def _plane_contacts(
     gate = torch.where(state[..., 10] > 0, gate, 0.0)
 
     def features(*inputs: Tensor, needed: Tensor | None = None) -> Tensor:
-        """Vectors, one after the other, and scalars."""
+        """Concatenated vectors and scalars."""
         x = PlaneRows(*inputs)
         point_velocity, own_normal, arm, spacing, _ = x.state.split([3, 3, 3, 1, 1], -1)
         K = _impulse_response(x.inverse, arm)
@@ -229,5 +233,5 @@ def _plane_contacts(
 
 
 def _within_cutoff(x: Float[Tensor, "*p c"], gate: Float[Tensor, "*p"]) -> Float[Tensor, "*p c"]:
-    """Features with 0 where the gate is 0: there they may be huge, and must not enter the gradient."""
+    """Set features to 0 where the gate is 0, where they may be huge and must not enter the gradient."""
     return torch.where(gate[..., None] > 0, x, 0.0)

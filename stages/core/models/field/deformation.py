@@ -17,12 +17,12 @@ from stages.core.models.field.rest_shape import NEIGHBOURHOOD_RADII, RestShape
 if TRITON:
     from stages.core.kernels.field.skinny_matmul import skinny_matmul
 
-# Ranges of the learned springs: limits of stability of explicit steps of a frame; hand-chosen, no source.
-MAX_STIFFNESS = 2500.0  # of the springs to the rest shape [1/s^2]: a period of 1/8 s, six frames
-MAX_DAMPING = 100.0  # of the displacement rates [1/s]
-MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT = 8.0, 0.8  # of the additional springs and dampers of each scale
-MAX_DISPLACEMENT = 1.5  # of a keypoint [radii of gyration of its object]
-SCALE_COUNT = 1 + len(NEIGHBOURHOOD_RADII)  # displacements: absolute, and relative to each neighbourhood's mean
+# Upper limits of the learned springs, given by the stability of explicit steps of one FRAME; hand-chosen, no source.
+MAX_STIFFNESS = 2500.0  # largest stiffness of the springs to the rest shape [1/s^2]: a period of 1/8 s, six frames
+MAX_DAMPING = 100.0  # largest damping of the displacement rates [1/s]
+MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT = 8.0, 0.8  # largest weights of the additional springs and dampers of each scale
+MAX_DISPLACEMENT = 1.5  # largest displacement of a keypoint [radii of gyration of its object]
+SCALE_COUNT = 1 + len(NEIGHBOURHOOD_RADII)  # displacements: absolute, and relative to the mean of each neighbourhood
 VECTOR_COUNT = 3 * SCALE_COUNT + 3  # vector features of a keypoint
 
 
@@ -49,7 +49,7 @@ class DeformationNet(nn.Module):
         self.spring_constants = mlp(hidden, hidden, 2)  # stiffness and damping, from the embedding
 
     def springs(self, embedding: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
-        """Stiffness [1/s^2] and damping [1/s] of an object."""
+        """Return stiffness [1/s^2] and damping [1/s] of each object."""
         stiffness, damping = torch.sigmoid(self.spring_constants(embedding)).unbind(-1)
         return MAX_STIFFNESS * stiffness, MAX_DAMPING * damping
 
@@ -57,9 +57,10 @@ class DeformationNet(nn.Module):
         self, shape: RestShape, embedding: Float[Tensor, "b o h"], compliance_scale: Float[Tensor, "b o"],
         inputs: DeformationInputs,
     ) -> Float[Tensor, "b o n 3"]:  # fmt: skip
-        """Acceleration in the body frame [m/s^2], without net force and torque.
+        """Return accelerations in the body frame [m/s^2], without net force and torque.
 
-        The driving part is multiplied by `compliance_scale`, 1 or less (linear elasticity: strain is stress over E).
+        The driving part is multiplied by `compliance_scale`, which is at most 1 (linear elasticity: strain is
+        stress / E).
         """
         u, du, contact = inputs.u, inputs.du, inputs.contact
         size = shape.size[..., None, None]
@@ -76,8 +77,8 @@ class DeformationNet(nn.Module):
         static = torch.stack([shape.normal, arm, gravity], -2)
         layers, offset = (self.input_layer, self.decoder[0], self.decoder[2]), self.embedding_projection(embedding)
         weights = apply_layers(arm[..., :0], layers, torch.cat([dynamic, static], -2), offset[:, :, None])
-        # only features that vanish at rest are weighted, so a body without contact keeps its rest shape; springs
-        # restore (negative weights) and dampers slow down
+        # Only features that vanish at rest are weighted, so a body without contact keeps its rest shape. Springs and
+        # dampers have negative weights: springs restore the shape, dampers slow the motion down.
         spring, damper, drive = weights.unflatten(-1, (3, SCALE_COUNT)).unbind(-2)
         drive = compliance_scale[..., None, None] * drive
         spring, damper = torch.sigmoid(spring - 3), torch.sigmoid(damper - 2)
@@ -86,10 +87,10 @@ class DeformationNet(nn.Module):
 
 
 def _neighbourhood_means(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n s 9"]:
-    """Means of x over the s neighbourhoods of each point, whose weights are the rows of `blur`."""
+    """Means of x over the s neighbourhoods of each point, with the rows of `blur` as weights."""
     if blur.dtype == torch.float16 and triton_allowed(x):
         s = blur.shape[2]
-        rows = blur.flatten(2, 3)  # all neighbourhoods in one product
+        rows = blur.flatten(2, 3)  # one product for all neighbourhoods
         return skinny_matmul(rows, x).unflatten(2, (s, -1)).transpose(2, 3)
     if x.is_cuda or torch.compiler.is_compiling():
         return _product(blur.to(x), x)
@@ -103,7 +104,7 @@ def _product(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> F
 
 
 def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
-    """A vector field on the keypoints without its mean and without its net rotation (mass-weighted); 0 if padded."""
+    """Remove the mass-weighted mean and net rotation of a vector field on the keypoints; 0 where padded."""
     mass_fraction = shape.initial.mass_fraction[..., None]
     field = field - (mass_fraction * field).sum(2, keepdim=True)
     momentum = (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2)
@@ -113,7 +114,7 @@ def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor
 
 
 def bounded(shape: RestShape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
-    """Displacements [m] of at most MAX_DISPLACEMENT sizes of the object, all of an object scaled by the same factor."""
+    """Limit displacements [m] to MAX_DISPLACEMENT times the size of the object, by one scale factor per object."""
     maximum = MAX_DISPLACEMENT * shape.size
     largest = u.detach().square().sum(-1).amax(-1).sqrt()
     return u * (maximum / torch.maximum(largest, maximum))[..., None, None]

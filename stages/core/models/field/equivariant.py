@@ -1,4 +1,4 @@
-"""Rotation-equivariant layers: inner products of vectors go into an MLP, whose outputs weight those vectors.
+"""Rotation-equivariant layers: an MLP on the inner products of vectors, whose outputs weight the same vectors.
 
 Source: Villar et al. 2021, "Scalars are universal: equivariant machine learning, structured like classical physics".
 """
@@ -20,10 +20,10 @@ if TRITON:
 
 
 def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
-    """asinh of all g = k (k + 1) / 2 inner products; asinh compresses large ones to about their logarithm."""
+    """asinh of all g = k (k + 1) / 2 inner products; asinh compresses large values to about their logarithm."""
     k = vectors.shape[-2]
     row, column = torch.triu_indices(k, k, device=vectors.device)
-    # index_select: the backward pass of plain indexing sorts, which takes longer than everything else here
+    # index_select, because the backward pass of plain indexing sorts, which takes longer than everything else here
     if vectors.is_cuda:
         return torch.asinh((vectors.index_select(-2, row) * vectors.index_select(-2, column)).sum(-1))
     xyz = vectors.reshape(-1, k, 3).permute(2, 1, 0).contiguous()  # a CPU copies long rows faster than rows of three
@@ -32,7 +32,10 @@ def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
 
 
 def _asinh(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """asinh; without gradients by the formula of the GPU kernels: 0.8 instead of 3.6 ms for 480,000 (Intel Xeon)."""
+    """asinh; without gradients by the formula of the GPU kernels: 0.8 instead of 3.6 ms for 480,000 (Intel Xeon).
+
+    The faster formula is log(sqrt(x^2 + 1) + |x|) with the sign of x.
+    """
     if not kernels_allowed(x):
         return torch.asinh(x)
     return x.square().add_(1).sqrt_().add_(x.abs()).log_().copysign_(x)
@@ -57,10 +60,10 @@ def apply_layers(
     x: Float[Tensor, "*b i"], layers: Sequence[nn.Linear], vectors: Float[Tensor, "*b v 3"] | None = None,
     offset: Float[Tensor, "*#b k"] | None = None, active: bool = False, needed: Bool[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b j"]:  # fmt: skip
-    """Linear layers with SiLU between them; one Triton kernel where `kernel_choice.triton_allowed`.
+    """Apply linear layers with SiLU between them; one Triton kernel where `kernel_choice.triton_allowed`.
 
-    x: input; the inner products of `vectors` are put before it.
-    offset: added to the output of the first layer or, if `active`, to x; the same along the last batch dimension.
+    x: input; the inner products of `vectors` are prepended to it.
+    offset: added to the output of the first layer or, if `active`, to x; constant along the last batch dimension.
     active: apply SiLU to x + offset before the first layer.
     needed: rows whose result is needed; the kernel may return 0 in the others.
     """
@@ -89,7 +92,7 @@ class Perceptron(nn.Sequential):
 
 
 def mlp(inner: int, hidden: int, outer: int, output_scale: float = 1.0) -> Perceptron:
-    """Linear, SiLU, Linear; the initial weights of the last layer are multiplied by `output_scale`."""
+    """Build Linear, SiLU, Linear; the initial weights of the last layer are multiplied by `output_scale`."""
     last = nn.Linear(hidden, outer)
     with torch.no_grad():
         last.weight *= output_scale

@@ -1,8 +1,8 @@
-"""Learned force field: rigid bodies with deformation, accelerated by learned contact forces.
+"""Learned force field: rigid bodies with superimposed deformation, accelerated by learned contact forces.
 
-Built in: orientations on SO(3) with the bodies' inertia tensors; contact forces that act equally and oppositely at one
-point of both bodies, so linear and angular momentum are conserved; equivariance under rotations and under permutations
-of objects and keypoints; independence of padding; a limit on the penetration of floor and walls (`floor_response`).
+Built in: orientations on SO(3) with the bodies' inertia tensors; equal and opposite contact forces at a common point of
+both bodies, so that linear and angular momentum are conserved; equivariance under rotations and under permutations of
+objects and keypoints; independence of padding; a limit on the penetration of floor and walls (`floor_response`).
 Learned: the contact forces, the deformation and its stiffness.
 """
 
@@ -42,12 +42,14 @@ from stages.core.models.initial_conditions import InitialConditions, centre_of_m
 if TRITON:
     from stages.core.models.field import fused_step
 
-MAX_SINGLE_THREAD_POINTS = 10_000  # keypoints of a batch; one thread was measured to be faster up to 6,144
-# All three in units of E * size / mass, the squared frequency of an elastic body.
-MAX_TRAINED_STIFFNESS = 3.2e5  # largest in the training data [1/s^2]; the network gets at most this, see `encode`
-MAX_TRAINED_SOLID_STIFFNESS = 3e4  # of the stiffest compact object in training, the duck [1/s^2]; cap for solid bodies
-MAX_ELASTIC_STIFFNESS = 1e4  # of the analytic springs of solid bodies [1/s^2]; explicit steps of a frame stay stable
-ELASTIC_STIFFNESS_RATIO = 4.0  # of these springs over E size / mass: about the lowest mode of an MPM ball; by hand
+# Keypoints of a batch up to which a step runs on one CPU thread; one thread was measured to be faster up to 6,144.
+MAX_SINGLE_THREAD_POINTS = 10_000
+# Stiffnesses are values of E * size / mass, the squared frequency of an elastic body.
+MAX_TRAINED_STIFFNESS = 3.2e5  # largest stiffness in the training data [1/s^2]; upper limit of network inputs
+MAX_TRAINED_SOLID_STIFFNESS = 3e4  # stiffest compact object in training, the duck [1/s^2]; limit for solid bodies
+MAX_ELASTIC_STIFFNESS = 1e4  # limit for the analytic springs of solid bodies [1/s^2]; explicit FRAME steps stay stable
+# Stiffness of the analytic springs over E size / mass: about the lowest mode of an MPM ball; hand-chosen.
+ELASTIC_STIFFNESS_RATIO = 4.0
 
 
 class ContactEffect(NamedTuple):
@@ -81,15 +83,15 @@ class ForceField(Dynamics):
         self.deformation = DeformationNet(h) if deform else None
 
     def precompute(self, initial: InitialConditions) -> RestShape:
-        """Rest shapes of the objects: arms, normals, inertia and neighbourhoods."""
+        """Compute the rest shapes of the objects: arms, normals, inertia and neighbourhoods."""
         # 16-bit neighbourhoods for rollouts on a GPU: reading them dominates the cost of a step with many keypoints
         return rest_shape_of(initial, half=triton_allowed(initial.points))
 
     def encode(self, shape: RestShape) -> FieldScene:
-        """Embeddings and springs of the objects.
+        """Compute the embeddings and springs of the objects.
 
-        Stiffness beyond the training data is clamped to it, and the ratio is applied to the deformation instead
-        (`compliance_scale`): by linear elasticity strain is stress over E.
+        Stiffness beyond the range of the training data is clamped, and the deformation is scaled by the ratio instead
+        (`compliance_scale`), since by linear elasticity strain is stress / E.
         """
         w = shape.initial
         unit = w.mass.clamp_min(1e-6) / shape.size.clamp_min(1e-6)
@@ -101,7 +103,7 @@ class ForceField(Dynamics):
             none = torch.zeros_like(compliance_scale)
             return FieldScene(shape, embedding, none, none, compliance_scale)
         stiffness, damping = self.deformation.springs(embedding)
-        # hollow bodies (solidity 1), as in the published data, get learned springs alone and may stay dented
+        # hollow bodies (solidity 1), as in the published data, have only the learned springs and may stay dented
         elastic = (ELASTIC_STIFFNESS_RATIO * w.E / unit).clamp_max(MAX_ELASTIC_STIFFNESS) * (1 - 1 / w.solidity)
         return FieldScene(shape, embedding, stiffness + elastic, damping, compliance_scale)
 
@@ -136,7 +138,7 @@ class ForceField(Dynamics):
         shape = scene.shape
         m = fit_rigid_motion(shape.initial.mass_fraction, shape.arm, shape.keypoint_inverse, points, velocities)
         u, du = (m.u, m.du) if self.deformation is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
-        # the body turns as its keypoints do, with its own inertia
+        # the body has the spin of its keypoints, but its own inertia
         momentum = matvec(m.R, matvec(shape.initial.body_inertia, matvec(m.R.mT, m.spin)))
         return BodyState(m.com, quaternion(m.R), m.velocity, momentum, projected(shape, u), projected(shape, du))
 
@@ -177,11 +179,11 @@ class ForceField(Dynamics):
     def step(
         self, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
     ) -> BodyState:
-        """Symplectic splitting (Strang): half a drift, a velocity update by the forces, half a drift.
+        """Advance by dt with symplectic (Strang) splitting: half a drift, a velocity update by forces, half a drift.
 
-        Second order, and exact for a parabola. Contact forces act at one point of both bodies and arms are those of
-        the middle of the step, so linear and angular momentum are conserved to rounding. The springs to the rest shape
-        are integrated implicitly.
+        Second order, and exact for parabolic motion. Contact forces act at a common point of both bodies, with the arms
+        at the middle of the step, so linear and angular momentum are conserved to rounding. The springs to the rest
+        shape are integrated implicitly.
         """
         if self._use_fused_step(scene):
             return fused_step.step(self, scene, state, t, dt, external)
@@ -193,7 +195,7 @@ class ForceField(Dynamics):
     def stepping(
         self, scene: FieldScene, dt: float, external: ExternalForces
     ) -> Callable[[BodyState, Tensor | float], BodyState]:
-        """As that of Dynamics; what the fused steps have in common is collected once."""
+        """As Dynamics.stepping; the inputs that all fused steps share are collected once."""
         if self._use_fused_step(scene):
             return fused_step.FusedStep(self, scene, dt, external)
         return super().stepping(scene, dt, external)
@@ -201,7 +203,7 @@ class ForceField(Dynamics):
     def _split_step(
         self, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
     ) -> BodyState:
-        """`step` by PyTorch operations."""
+        """`step` in PyTorch operations."""
         movable = ~external.pinned[..., None]
         half = self._drifted(scene, without_pinned(state, movable), dt / 2)
         bodies = self._kinematics(scene, half)
@@ -270,7 +272,7 @@ class ForceField(Dynamics):
         """One round of contact message passing: encode, aggregate, update, decode; then the sum of the forces."""
         shape, embedding = scene.shape, scene.embedding
         if not (bodies.points.is_cuda or torch.compiler.is_compiling()):
-            # on a GPU the host would have to wait for their number
+            # not on a GPU, where the host would have to wait for the number of near objects
             shape = shape.with_near_others(bodies.points, SEARCH_RADIUS)
         w, others, back = shape.initial, shape.others, shape.back
         pairs, floor, wall = pair_contacts(shape, bodies), floor_contacts(shape, bodies), wall_contacts(shape, bodies)
@@ -285,7 +287,7 @@ class ForceField(Dynamics):
         a_f = push_only(self.planes.decode(x_f, weight_f, context_f, floor.vectors), floor, weight_f)
         a_w = push_only(self.planes.decode(x_w, weight_w, context_w, wall.vectors), wall, weight_w)
         friction = MAX_FRICTION_SPEED * torch.sigmoid(self.friction(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
-        if others.shape[1]:  # an object also gets the friction of those it touches, as of one it stands on
+        if others.shape[1]:  # an object also gets the friction of the objects that it touches, e.g. stands on
             friction = torch.maximum(friction, (weight.sum(-1) * friction[:, others, 0]).amax(-1, keepdim=True))
         mass, inverse_mass = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~external.pinned
         # a pinned object has infinite mass
@@ -303,7 +305,7 @@ class ForceField(Dynamics):
     def _pair_sums(
         self, shape: RestShape, bodies: BodyKinematics, pairs: ContactPoints, F: Float[Tensor, "b o m n 3"]
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"]]:
-        """Force [N] and torque [N m] on each object by the pair forces F and their reactions, at the gaps' middles."""
+        """Force [N] and torque [N m] on each object by the pair forces F and their reactions, at gap midpoints."""
         com = bodies.com
         middle = com[:, :, None, None] + pairs.vectors[..., 4, :] * ARM_UNIT
         middle = middle - pairs.vectors[..., 0, :] * (GAP_UNIT / 2)
@@ -313,18 +315,18 @@ class ForceField(Dynamics):
         return F.sum(2) - self._reaction(shape, F), torque - self._reaction(shape, counter)
 
     def _reaction(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
-        """Sum over each object's partners of x, the effect of the object on the partner; its reaction is subtracted."""
+        """Sum over each object's partners of the partners' values of x for it; subtracted as the reaction."""
         return x[:, shape.others, shape.back].sum(2)
 
 
 def has_small_operations(arm: Float[Tensor, "b o n 3"]) -> bool:
-    """Whether most operations of a step are too small for several CPU threads; with gradients, threads are kept."""
+    """Whether most operations of a step are too small for several CPU threads; false with gradients."""
     points = arm.shape[0] * arm.shape[1] * arm.shape[2]
     return not arm.is_cuda and not torch.is_grad_enabled() and points <= MAX_SINGLE_THREAD_POINTS
 
 
 def without_pinned(state: BodyState, movable: Bool[Tensor, "b o 1"]) -> BodyState:
-    """The state with zero velocities of pinned objects."""
+    """Return the state with the velocities of pinned objects set to zero."""
     return state._replace(
         velocity=state.velocity * movable, momentum=state.momentum * movable, du=state.du * movable[..., None]
     )

@@ -5,8 +5,8 @@
     _messages   project_embeddings encode_messages aggregate_messages update_contacts decode_forces
     _update     update_velocities split_matmul deformation_features internal_accelerations update_displacements
 
-The reference is `ForceField.step`. Intermediate tensors store coordinates apart: for an object all x, then all y, then
-all z. Contact points of an object lie in one list: a segment for each other object, then floor, then walls.
+The reference is `ForceField.step`. Intermediate tensors store coordinates separately: for each object all x, then all
+y, then all z. The contact points of an object are in one list: a segment per other object, then floor, then walls.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from stages.core.models.field.floor_response import (
 )
 from stages.core.models.field.state import MAX_SPEED, MAX_SPIN, BodyState, FieldScene
 
-MAX_KEYPOINTS = 4096  # of an object: a kernel holds all of them in registers
-ROWS = layers.ROWS.value  # contact points or keypoints of a block
+MAX_KEYPOINTS = 4096  # largest number of keypoints of an object: a kernel holds all of them in registers
+ROWS = layers.ROWS.value  # contact points or keypoints per block
 CONSTANTS = bodies.FieldConstants(
     FRAME=FRAME, SEARCH_RADIUS=near.SEARCH_RADIUS, NO_CONTACT=near.NO_CONTACT, FULL_CONTACT=near.FULL_CONTACT,
     PAIR_FRACTION=near.PAIR_FRACTION, WALL_FRACTION=near.WALL_FRACTION, GAP_UNIT=near.GAP_UNIT,
@@ -57,7 +57,7 @@ CONSTANTS = bodies.FieldConstants(
 
 
 def fits(field: nn.Module, scene: FieldScene) -> bool:
-    """Whether the kernels support this ForceField and scene; they index their outputs with 32 bits."""
+    """Whether the kernels, which index their outputs with 32 bits, support this ForceField and scene."""
     b, o, n, _ = scene.shape.arm.shape
     sizes = field.config["deform"] and field.config["hidden"] in (16, 32, 64, 128) and n <= MAX_KEYPOINTS
     half = scene.shape.blur.dtype == torch.float16  # set by `ForceField.precompute` on CUDA in single precision
@@ -72,7 +72,7 @@ def step(
 
 
 def points(scene: FieldScene, state: BodyState) -> Tensor:
-    """Positions of the keypoints (b o n 3) [m], as `ForceField.points`."""
+    """Return the positions of the keypoints (b o n 3) [m], as `ForceField.points`."""
     b, o, n, _ = state.u.shape
     state = BodyState(*(x.contiguous() for x in state))
     out = torch.empty_like(state.u)
@@ -96,7 +96,7 @@ def _network(layers: nn.Sequential) -> tuple[tuple[Tensor, Tensor], ...]:
 
 
 class _Layers(NamedTuple):
-    """The layers of each kernel that evaluates networks."""
+    """Layers of each kernel that evaluates networks."""
 
     embeddings: contact_messages.EmbeddingLayers
     encoder: contact_messages.EncoderLayers
@@ -137,10 +137,10 @@ def _collect_layers(field: nn.Module) -> _Layers:
 
 
 class FusedStep:
-    """Step of one rollout as a function of state and time, of four groups of kernel launches.
+    """Step of one rollout as a function of state and time, in four groups of kernel launches.
 
-    It holds what all steps have in common: sizes, contiguous inputs and layers. The weights may change in place while
-    it is used; what it is made from must not change otherwise.
+    Holds what all steps share: sizes, contiguous inputs and layers. The weights may change in place during use; the
+    other arguments must not change.
     """
 
     def __init__(self, field: nn.Module, scene: FieldScene, dt: float, external: ExternalForces):

@@ -12,8 +12,10 @@ from stages.core.kernels.threads import large_operation, parallel_map
 if TRITON:
     from stages.core.kernels.field.nearest import nearest_between_objects as nearest_triton
 
-BLOCK_POINTS = 64  # rows of the distance matrix at a time, which stay in the cache; 32 to 128 take the same time
-PARALLEL_MIN_DISTANCES = 1 << 20  # below, the search takes at most 0.4 ms, and waking a thread 0.1 ms (Intel Xeon)
+BLOCK_POINTS = 64  # rows of the distance matrix per block, so that it stays in the cache; 32 to 128 take the same time
+# Number of distances from which several threads are used: a smaller search takes at most 0.4 ms, and waking a thread
+# 0.1 ms (Intel Xeon).
+PARALLEL_MIN_DISTANCES = 1 << 20
 CULLING_MIN_POINTS = 500  # keypoints of a scene from which culling by bounding boxes is faster on a CPU; measured
 
 Nearest = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
@@ -21,10 +23,10 @@ Nearest = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
 
 @torch.no_grad()
 def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
-    """For point n of object i and every object j: the distance [m] to j's nearest point, and its index.
+    """Return for each point n of object i the distance [m] to the nearest point of each object j, and its index.
 
-    The distance is infinite where it is not below `radius` [m], to the own object, to padding and from padding; the
-    index is then undefined.
+    The distance is infinite, and the index undefined, where it is not below `radius` [m], for j = i, and to or from
+    padding.
     """
     if TRITON and points.is_cuda and points.dtype == torch.float32:
         return nearest_triton(points, valid, radius)
@@ -35,8 +37,11 @@ def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radi
 
 
 def _all_pairs(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
-    """`nearest` by brute force: candidates from one matrix product of centred coordinates in single precision, the
-    distance from the difference of the two points."""
+    """`nearest` by brute force.
+
+    One matrix product of centred coordinates in single precision finds the nearest points; their distances are computed
+    from coordinate differences.
+    """
     o = points.shape[1]
     count = valid.sum((1, 2)).clamp_min(1)
     centre = torch.where(valid[..., None], points, 0.0).sum((1, 2)) / count[:, None]
@@ -90,9 +95,9 @@ def _nearest_index(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tens
 
 
 def _argmin(x: Float[Tensor, "*b n"]) -> Int[Tensor, "*b"]:
-    """Index of the smallest entry of each row, of equal ones the first.
+    """Index of the smallest entry of each row; the first of equal entries.
 
-    On a CPU by NumPy, whose search uses vector instructions: 2048 x 2048 take 0.6 ms, by PyTorch 5.5 ms (Intel Xeon).
+    On a CPU by NumPy, whose search uses vector instructions: 0.6 ms for 2048 x 2048, PyTorch 5.5 ms (Intel Xeon).
     """
     return x.argmin(-1) if x.is_cuda else torch.from_numpy(x.numpy().argmin(-1))
 

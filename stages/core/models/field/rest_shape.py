@@ -17,9 +17,9 @@ from stages.core.models.initial_conditions import InitialConditions, inertia, of
 if TRITON:
     from stages.core.kernels.field.neighbourhoods import neighbourhood_weights
 
-NEIGHBOURHOOD_RADII = (0.12, 0.4)  # of Gaussian neighbourhoods [radii of gyration]; hand-chosen, no source
-MIN_NEIGHBOUR_WEIGHT = 1e-20  # smaller weights become 0: a CPU is several times slower with subnormal numbers
-MIN_EXPONENT = math.log(MIN_NEIGHBOUR_WEIGHT) - 1  # that the exponential function sees: it also slows down for them
+NEIGHBOURHOOD_RADII = (0.12, 0.4)  # radii of Gaussian neighbourhoods [radii of gyration]; hand-chosen, no source
+MIN_NEIGHBOUR_WEIGHT = 1e-20  # smaller weights are set to 0: subnormal numbers make a CPU several times slower
+MIN_EXPONENT = math.log(MIN_NEIGHBOUR_WEIGHT) - 1  # lower limit of exponents, so that exp returns no subnormal numbers
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class RestShape:
     normal: Float[Tensor, "b o n 3"]  # outward, of length up to 1; shorter where the outward side is uncertain
     spacing: Float[Tensor, "b o n"]  # distance to the nearest keypoints [m]
     size: Float[Tensor, "b o"]  # radius of gyration [m]
-    inverse: Float[Tensor, "b o 3 3"]  # of the body's inertia tensor per unit of mass, rest orientation [1/m^2]
-    keypoint_inverse: Float[Tensor, "b o 3 3"]  # the same of the keypoints alone, as of a hollow body [1/m^2]
+    inverse: Float[Tensor, "b o 3 3"]  # inverse of the body's inertia tensor per unit of mass, at rest [1/m^2]
+    keypoint_inverse: Float[Tensor, "b o 3 3"]  # the same for the keypoints as point masses, a hollow body [1/m^2]
     principal: Float[Tensor, "b o 3"]  # eigenvalues of `keypoint_inverse`, ascending [1/m^2]
     blur: Float[Tensor, "b o s n n"]  # averaging weights of the neighbourhoods, rows sum to 1; 16-bit for the kernels
-    others: Int[Tensor, "o m"]  # for each object the indices of the m = o - 1 others, or of those near it
+    others: Int[Tensor, "o m"]  # for each object the indices of its partners: the m = o - 1 others, or those near it
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
 
     def __getitem__(self, rows: slice | Tensor) -> RestShape:
@@ -44,9 +44,9 @@ class RestShape:
         return replace(self, **{name: getattr(self, name)[rows] for name in batched})
 
     def with_near_others(self, points: Float[Tensor, "b o n 3"], reach: float) -> RestShape:
-        """The same where an object's partners are those whose bounding boxes are within `reach` [m] in any scene.
+        """Return a copy in which an object's partners are those with bounding boxes within `reach` [m] in any scene.
 
-        Objects with fewer partners than the most have themselves as the remaining ones, which they do not touch.
+        `others` is padded with the object itself, which it never touches, if another object has more partners.
         """
         valid = self.initial.valid[..., None]
         low = points.masked_fill(~valid, torch.inf).amin(2)
@@ -58,15 +58,18 @@ class RestShape:
         row = torch.arange(len(near), device=near.device)[:, None]
         column = torch.arange(count, device=near.device)
         real = column < near.sum(1, keepdim=True)
-        first = (~near).int().argsort(dim=1, stable=True)[:, :count]  # the near ones, in order
-        rank = near.cumsum(1) - 1  # of each partner among those of an object
+        first = (~near).int().argsort(dim=1, stable=True)[:, :count]  # near objects, in ascending order
+        rank = near.cumsum(1) - 1  # position of each partner in the list of an object
         others = torch.where(real, first, row)
         return replace(self, others=others, back=torch.where(real, rank[others, row], column))
 
 
 @torch.no_grad()
 def rest_shape_of(initial: InitialConditions, half: bool = False) -> RestShape:
-    """Rest shapes of a batch; `half`: neighbourhood weights in half precision, computed by a Triton kernel."""
+    """Compute the rest shapes of a batch.
+
+    With `half` the neighbourhood weights are in half precision and computed by a Triton kernel.
+    """
     arm = offsets(initial, initial.points)
     size = (initial.mass_fraction * arm.square().sum(-1)).sum(-1).clamp_min(1e-8).sqrt()
     normal, spacing = normals_and_spacing(arm, initial.valid)
@@ -86,9 +89,9 @@ def _neighbourhoods(
     arm: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], mass_fraction: Float[Tensor, "b o n"],
     radii: Float[Tensor, "b o s"],
 ) -> Float[Tensor, "b o s n n"]:  # fmt: skip
-    """Mass-weighted Gaussians of each of the `radii` [m] about each point, rows normalised; 0 where padded.
+    """Mass-weighted Gaussian weights about each point for each of the `radii` [m]; rows sum to 1, or 0 where padded.
 
-    Sums of squared differences are accurate for near points, and measured 50 times faster than cdist on a GPU.
+    Summing squared differences is accurate for near points, and was measured 50 times faster than cdist on a GPU.
     """
     squared = arm.new_zeros(*valid.shape, valid.shape[-1])
     for c in arm.unbind(-1):

@@ -1,4 +1,4 @@
-"""Rigid-body motion: rotation vectors, quaternions, drift without forces, and the best rigid fit to moving points."""
+"""Rigid-body motion: rotation vectors, quaternions, force-free drift, and the least-squares fit to moving points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def exponential(rotation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
 
 
 def rotated(quats: Float[Tensor, "*b 4"], rotation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Orientations (unit quaternions w x y z) after a further rotation about world axes [rad]."""
+    """Orientations (unit quaternions w x y z) after a further rotation vector in world axes [rad]."""
     q = multiply(exponential(rotation), quats)
     return q / q.norm(dim=-1, keepdim=True)
 
@@ -31,7 +31,7 @@ def rotated(quats: Float[Tensor, "*b 4"], rotation: Float[Tensor, "*b 3"]) -> Fl
 def angular_velocity(
     momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], R: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Angular velocity [rad/s] of an angular momentum per unit of mass [m^2/s], both in world axes.
+    """Angular velocity [rad/s] for an angular momentum per unit of mass [m^2/s], both in world axes.
 
     `inverse` is the inverse inertia tensor per unit of mass in the rest orientation [1/m^2], R the rotation from it.
     """
@@ -41,9 +41,9 @@ def angular_velocity(
 def pose(
     quat: Float[Tensor, "*b 4"], momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"]
 ) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
-    """Rotation matrices, and angular velocities [rad/s] as `angular_velocity` defines them.
+    """Rotation matrices, and angular velocities [rad/s]; see `angular_velocity`.
 
-    One kernel without gradients where `kernel_choice.kernels_allowed`.
+    Uses one kernel without gradients where `kernel_choice.kernels_allowed`.
     """
     if kernels_allowed(quat):
         return kernels.pose(quat, momentum, inverse)
@@ -57,7 +57,7 @@ def drift(
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 4"]]:  # fmt: skip
     """Centres of mass [m] and orientations after dt [s] of force-free motion.
 
-    Rotations use the angular velocity at half the step (explicit midpoint rule, second order). One kernel without
+    Rotations use the angular velocity at half the step (explicit midpoint rule, second order). Uses one kernel without
     gradients where `kernel_choice.kernels_allowed`.
     """
     if kernels_allowed(quat):
@@ -73,7 +73,7 @@ def clamp_norm(x: Float[Tensor, "*b 3"], maximum: float) -> Float[Tensor, "*b 3"
 
 
 class RigidFit(NamedTuple):
-    """Least-squares rigid motion of moving points, and the residual as deformation."""
+    """Least-squares rigid motion of moving points; the residual is the deformation."""
 
     R: Float[Tensor, "b o 3 3"]
     com: Float[Tensor, "b o 3"]  # [m]
@@ -87,7 +87,7 @@ def fit_rigid_motion(
     mass_fraction: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"], inverse: Float[Tensor, "b o 3 3"],
     points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"],
 ) -> RigidFit:  # fmt: skip
-    """Rigid motion of `points` [m] moving with `velocities` [m/s], whose offsets at rest are `arm` [m].
+    """Fit a rigid motion to `points` [m] moving with `velocities` [m/s], whose offsets at rest are `arm` [m].
 
     `inverse` is the inverse inertia tensor per unit of mass at rest [1/m^2].
     Source: Mueller et al. 2005, "Meshless deformations based on shape matching", section 3.
@@ -97,7 +97,7 @@ def fit_rigid_motion(
     present = weight > 0
     offset = torch.where(present, points - com[:, :, None], 0.0)
     relative = torch.where(present, velocities - velocity[:, :, None], 0.0)
-    # a small multiple of the identity: collinear or coplanar points leave a rotation undetermined
+    # regularise by a small multiple of the identity: collinear or coplanar points do not determine a rotation
     eye = torch.eye(3, dtype=arm.dtype, device=arm.device)
     spread = (weight * arm.square()).sum((2, 3))[..., None, None]
     R = nearest_rotation((weight * offset).mT @ arm + 1e-6 * (spread + 1e-6) * eye)

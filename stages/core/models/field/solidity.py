@@ -1,4 +1,4 @@
-"""Solidity: ratio of a compact body's bending stiffness to that of a thin-walled one of the same material."""
+"""Solidity: bending stiffness of a compact body relative to a thin-walled body of the same material."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 MIN_STIFFNESS = 3e3  # Young's modulus of the softest bodies in training [Pa]; stiffer ones are extrapolated
-REFERENCE_THICKNESS = 0.015  # volume over surface of the published objects, all hollow or thin [m]; measured on them
+REFERENCE_THICKNESS = 0.015  # measured volume / surface of the published objects, which are all hollow or thin [m]
 
 
 def solidity(points: Float[Tensor, "n 3"], volume: float) -> float:
     """Stiffness ratio from points on the surface [m] and the volume [m^3]; 1 for hollow or thin bodies.
 
-    (volume / surface / REFERENCE_THICKNESS) cubed, as the bending stiffness of a plate grows with the cube of its
+    It is (volume / surface / REFERENCE_THICKNESS)^3, since the bending stiffness of a plate grows with the cube of its
     thickness. The surface is that of the box of `box_sides`. A heuristic without a source.
     """
     a, b, c = box_sides(points).tolist()

@@ -1,9 +1,9 @@
 """The force field with solved contacts: rigid motion by `kernels.field.rigid_frames`, deformation by the network.
 
-For one scene whose bodies' surfaces are known. Contact of the published simulation, which `ForceField` has learned,
-makes bodies stick and knows one coefficient of friction. Here bodies do not enter each other, friction and restitution
-are those of the materials, and the learned deformation answers the forces that this takes. Contacts are those of the
-undeformed surfaces: the network's displacements under a lasting load do not become constant, so that bodies on deformed
+For one scene whose bodies' surfaces are known. In the published simulation, from which `ForceField` has learned,
+contacts are sticky and have a single coefficient of friction. Here a contact solver prevents penetration, with the
+friction and restitution of the materials, and the learned deformation responds to its contact forces. Contacts use the
+undeformed surfaces: the network's displacements under a sustained load do not become constant, so bodies on deformed
 surfaces did not come to rest.
 """
 
@@ -26,13 +26,13 @@ from stages.core.models.field.equivariant import matvec
 from stages.core.models.field.force_field import ForceField, has_small_operations, without_pinned
 from stages.core.models.field.state import MAX_SPEED, BodyState, FieldScene
 
-SUBSTEPS = 4  # of rigid motion per step: contacts are linear in the motion, so a body may turn little in each
+SUBSTEPS = 4  # substeps of rigid motion per step: contacts are linearised, so a body may rotate only little in each
 
 
 class SolvedForceField(ForceField):
-    """`field` with solved contacts of bodies with these surfaces, for batches of one scene.
+    """`field` with solved contacts between bodies with the given surfaces, for batches of one scene.
 
-    `load`: the mean force [N] of contacts on each body in the last step, and its torque about the centre of mass [N m].
+    `load` is the mean contact force [N] on each body in the last step, and its torque about the centre of mass [N m].
     """
 
     def __init__(self, field: ForceField, surfaces: BodySurfaces):
@@ -46,14 +46,14 @@ class SolvedForceField(ForceField):
     def step(
         self, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
     ) -> BodyState:
-        """As that of ForceField, with the velocities that the contacts allow."""
+        """As ForceField.step, with velocities from the contact solver."""
         if has_small_operations(scene.shape.arm):
             with small_operations():
                 return self._solved_step(scene, state, t, dt, external)
         return self._solved_step(scene, state, t, dt, external)
 
     def derivative(self, scene: FieldScene, t: Tensor | float, state: BodyState, external: ExternalForces) -> BodyState:
-        """Rate of change of the state, for ODE solvers: the mean of a step of one FRAME."""
+        """Rate of change of the state, for ODE solvers: the mean over a step of one FRAME."""
         new = self._solved_step(scene, state, t, FRAME, external)
         return BodyState(*((y - x) / FRAME for x, y in zip(state, new, strict=True)))
 
@@ -80,9 +80,10 @@ class SolvedForceField(ForceField):
     def _rigid_motion(
         self, scene: FieldScene, state: BodyState, interval: tuple[Tensor | float, float], external: ExternalForces
     ) -> tuple[BodyState, Float[Tensor, "b o n 3"]]:
-        """Rigid motion in the `interval` (t, dt) [s], and the mean accelerations of the keypoints by contact [m/s^2].
+        """Advance the rigid motion over the `interval` (t, dt) [s].
 
-        Accelerations are in the bodies' frames. External forces are those of the start.
+        Returns the new state, and the mean accelerations of the keypoints by contact [m/s^2] in the bodies' frames.
+        External forces act at the initial positions of the keypoints.
         """
         w, shape, (_, dt) = scene.shape.initial, scene.shape, interval
         applied, twist = external.wrench(self.points(scene, state), state.com, *interval)
@@ -101,5 +102,5 @@ class SolvedForceField(ForceField):
         )  # fmt: skip
         if self.load is None or self.load.shape != load.shape:
             self.load = torch.empty_like(load)
-        self.load.copy_(load)  # at a fixed address, for CUDA graphs
+        self.load.copy_(load)  # keeps its address, as CUDA graphs need
         return BodyState(*rigid, state.u, state.du), accelerations

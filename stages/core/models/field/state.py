@@ -10,8 +10,8 @@ from torch import Tensor
 
 from stages.core.models.field.rest_shape import RestShape
 
-MAX_SPEED = 8.0  # speeds of bodies and deformation rates are clipped to it [m/s]; hand-chosen, no source
-MAX_SPIN = 60.0  # angular velocities are clipped to it [rad/s]; hand-chosen, no source
+MAX_SPEED = 8.0  # upper limit of the speeds of bodies and of deformation rates [m/s]; hand-chosen, no source
+MAX_SPIN = 60.0  # upper limit of angular velocities [rad/s]; hand-chosen, no source
 
 
 class BodyState(NamedTuple):
@@ -27,7 +27,7 @@ class BodyState(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldScene:
-    """Values computed once per rollout: the rest shapes and the network outputs for shape and material."""
+    """Values computed once per rollout: the rest shapes, and the network outputs for shape and material."""
 
     shape: RestShape
     embedding: Float[Tensor, "b o h"]  # of each object's shape and material

@@ -1,7 +1,8 @@
-"""Candidate objects: the nodes of the merge tree of voxels that are not surface, and what is known of each.
+"""Candidate objects: the nodes of a merge tree over the voxels that are not surface, and features of each node.
 
-A network scores the candidates by these features, which are sums over their voxels and links, so that they are few and
-mean the same in simulated and in real scenes. The idea is the score branch of PointGroup (Jiang et al. 2020).
+A network scores the candidates by these features. They are computed from sums over the voxels and links of a candidate,
+so they are few and mean the same in simulated and real scenes. The idea is the score branch of PointGroup (Jiang et al.
+2020).
 """
 
 from __future__ import annotations
@@ -20,28 +21,29 @@ from stages.core.models.segmenter.merge_tree import MergeTree, merge_tree
 from stages.core.models.segmenter.network import PAIR_FEATURES, Level, Prediction, Segmenter
 from stages.core.models.segmenter.voxels import VOXEL, VoxelGrid
 
-TOGETHER = 2.0  # log odds above which voxels of one cell of the next coarser grid are not parted
-MAX_SURFACE = 0.5  # probability of surface, up to which a voxel may be of an object
-MIN_VOXELS = 6  # of a candidate
-LINK_REACH, LINKS = 3.0, 8  # voxels and nearest voxels, within which links cross gaps of sparse Gaussians
-NO_PARENT = -6.0  # log odds of the merge above a root
+TOGETHER = 2.0  # log odds above which voxels in the same cell of the next coarser grid are joined into one leaf
+MAX_SURFACE = 0.5  # voxels with a smaller probability of the class surface may belong to an object
+MIN_VOXELS = 6  # smallest number of voxels of a candidate
+LINK_REACH, LINKS = 3.0, 8  # reach [voxels] and number of nearest voxels of links, which cross gaps of sparse Gaussians
+NO_PARENT = -6.0  # feature of a root in place of the log odds of the merge into its parent
 COLOUR, EMBEDDING = slice(21, 25), slice(25, 26 + PAIR_FEATURES)  # columns of the sums over voxels
-ALIKE, UNLIKE = 0.05, 3.0  # least difference from a sibling that counts, and the difference where there is none
-SMALL = 0.003  # of logarithms of distances [camera distance]
+# Constant added to a difference from a sibling before taking the logarithm, and the difference if there is no sibling.
+ALIKE, UNLIKE = 0.05, 3.0
+SMALL = 0.003  # constant added to distances before taking the logarithm [camera distance]
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Nodes of a merge tree over groups of up to eight voxels."""
+    """Nodes of a merge tree whose leaves are groups of up to eight voxels."""
 
-    voxels: Int[Tensor, "m"]  # of the grid
-    leaf: Int[Tensor, "m"]  # of the tree, for each of these voxels
+    voxels: Int[Tensor, "m"]  # voxels of the grid that are in the tree
+    leaf: Int[Tensor, "m"]  # leaf of the tree that each of these voxels is in
     tree: MergeTree
-    features: Float[Tensor, "k f"]  # of every node
+    features: Float[Tensor, "k f"]  # features of every node
 
     @property
     def sizes(self) -> Float[Tensor, "k"]:
-        """Voxels of each node."""
+        """Number of voxels of each node."""
         return self.features[:, 0].exp()
 
     @property
@@ -50,14 +52,14 @@ class Candidates:
         return self.features[:, 6].exp()
 
     def sums(self, values: Num[Tensor, "v d"]) -> np.ndarray:
-        """(nodes, d) sums over the voxels of each node, of values for the voxels of the grid."""
+        """Sum values given for the voxels of the grid over the voxels of each node: (nodes, d)."""
         leaves = torch.zeros(self.tree.count, values.shape[1]).double()
         return self.tree.sums(leaves.index_add_(0, self.leaf, values[self.voxels].double()).numpy())
 
 
 @torch.no_grad()
 def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, model: Segmenter) -> Candidates:
-    """The merge tree of the voxels that may be of an object, by the affinities of those close to each other."""
+    """Build the merge tree of the voxels that may belong to objects, from the affinities of nearby voxels."""
     log_chance = found.logits.log_softmax(1)
     chance = log_chance.exp()
     voxels = torch.nonzero(chance[:, 0] < MAX_SURFACE)[:, 0]
@@ -91,7 +93,7 @@ def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, mod
 
 
 def _unique_pairs(pairs: Int[Tensor, "e 2"], count: int) -> Int[Tensor, "u 2"]:
-    """Each pair of numbers below `count` once, the smaller number first."""
+    """Remove duplicates from pairs of numbers below `count`; the smaller number of each pair comes first."""
     low, high = pairs.sort(1).values.unbind(1)
     key = (low * count + high).unique()
     return torch.stack([key // count, key % count], 1)
@@ -100,7 +102,10 @@ def _unique_pairs(pairs: Int[Tensor, "e 2"], count: int) -> Int[Tensor, "u 2"]:
 def _leaves(
     edges: Int[Tensor, "e 2"], odds: Float[Tensor, "e"], cell: Int[Tensor, "m"]
 ) -> tuple[Int[Tensor, "m"], int]:
-    """The leaf of each voxel and their number: voxels of one cell that are connected by odds above TOGETHER."""
+    """Return the leaf of each voxel, and the number of leaves.
+
+    A leaf consists of voxels in one cell of the coarser grid that are connected by log odds above TOGETHER.
+    """
     i, j = edges[(odds > TOGETHER) & (cell[edges[:, 0]] == cell[edges[:, 1]])].T.numpy()
     graph = coo_matrix((np.ones(len(i)), (i, j)), shape=(len(cell), len(cell)))
     count, leaf = connected_components(graph, directed=False)
@@ -108,7 +113,7 @@ def _leaves(
 
 
 def adjacent_pairs(neighbours: Int[Tensor, "v 27"], voxels: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
-    """All pairs of adjacent voxels among `voxels`, each once."""
+    """Return all pairs of adjacent voxels among `voxels`, each once."""
     count = len(neighbours)
     inside = torch.zeros(count + 1, dtype=torch.bool, device=voxels.device)
     inside[voxels] = True
@@ -118,7 +123,7 @@ def adjacent_pairs(neighbours: Int[Tensor, "v 27"], voxels: Int[Tensor, "m"]) ->
 
 
 def nearby_pairs(points: Float[Tensor, "v 3"], voxels: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
-    """Pairs of voxels among `voxels` with their LINKS nearest within LINK_REACH."""
+    """Return pairs of each of `voxels` with its LINKS nearest ones among them, if within LINK_REACH."""
     if not len(voxels):
         return torch.zeros(0, 2, dtype=torch.int64, device=voxels.device)
     distance, index = knn(points[voxels], points[voxels], min(LINKS + 1, len(voxels)))
@@ -128,14 +133,14 @@ def nearby_pairs(points: Float[Tensor, "v 3"], voxels: Int[Tensor, "m"]) -> Int[
 
 
 def _with_square(values: Float[Tensor, "m d"]) -> Float[Tensor, "m d+1"]:
-    """The values and their squared norm, from whose means the spread follows."""
+    """Append the squared norm to the values; their spread follows from the means of both."""
     return torch.cat([values, (values**2).sum(1, keepdim=True)], 1)
 
 
 def _contrasts(tree: MergeTree, mean: np.ndarray) -> list[np.ndarray]:
-    """Spread of a quantity in each node, and logarithms of its distance from the sibling and between the two children.
+    """Spread of a quantity in each node, and log differences of its mean from the sibling and between the children.
 
-    `mean` has the quantity and last its squared norm. Parts of one object are often alike.
+    The last column of `mean` is the mean squared norm of the quantity. Parts of one object are often alike.
     """
     value, spread = mean[:, :-1], np.sqrt(np.maximum(mean[:, -1] - (mean[:, :-1] ** 2).sum(1), 0))
     a, b = tree.children.T
@@ -146,11 +151,14 @@ def _contrasts(tree: MergeTree, mean: np.ndarray) -> list[np.ndarray]:
 
 
 def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(nodes, network.CANDIDATE_FEATURES) features from sums of `leaves` and maxima of `corners`, see above."""
+    """Compute (nodes, network.CANDIDATE_FEATURES) features from sums of `leaves` and maxima of `corners`.
+
+    For the columns of both see `find_candidates`.
+    """
     sums, top = tree.sums(leaves), tree.maxima(corners)
     n, mean = sums[:, 0], sums / sums[:, :1]
     links = np.stack([tree.link_sum, tree.link_count], 1)
-    inner = tree.sums_within(links)  # sum and number of the links inside each node
+    inner = tree.sums_within(links)  # sum and number of the links within each node
     border = sums[:, -2:] - 2 * inner
     merged = np.concatenate([np.zeros(tree.count), links[:, 0] / np.maximum(links[:, 1], 1)])
     parents, sibling = tree.parents(), np.zeros(len(tree))
@@ -158,8 +166,8 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
     extent = top[:, :3] + top[:, 3:] + VOXEL
     sides = np.sort(extent, 1)
     radius = np.sqrt(np.maximum((mean[:, 7:10] - mean[:, 4:7] ** 2).sum(1), 1e-6))
-    scatter = np.sqrt(np.maximum((mean[:, 13:16] - mean[:, 10:13] ** 2).sum(1), 0))  # of the predicted centres
-    shift = np.linalg.norm(mean[:, 10:13] - mean[:, 4:7], axis=1)  # of their mean from the node's own centre
+    scatter = np.sqrt(np.maximum((mean[:, 13:16] - mean[:, 10:13] ** 2).sum(1), 0))  # spread of the predicted centres
+    shift = np.linalg.norm(mean[:, 10:13] - mean[:, 4:7], axis=1)  # distance of their mean from the node's own centre
     columns = [
         np.log(n), mean[:, 1], mean[:, 2], mean[:, 3], *np.log(sides.T), np.log(extent[:, 2]),
         scatter / radius, shift / radius, mean[:, 16] / radius, np.log(scatter + SMALL), np.log(shift + SMALL),

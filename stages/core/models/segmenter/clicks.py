@@ -1,4 +1,4 @@
-"""Objects that the user points at: of the candidates of the network, those with the points in them."""
+"""Interactive segmentation: selects the candidates of the network that contain points given by the user."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-CLICK_REACH = 0.03  # of a candidate's surfels from the point [camera distance]
+CLICK_REACH = 0.03  # largest distance of a click from the nearest surfel of a candidate [camera distance]
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,10 @@ class Click:
 
 @torch.no_grad()
 def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], limits: ObjectLimits) -> Int[Tensor, "n"]:
-    """Object number of each Gaussian, that of the clicks on it; 0 for the rest.
+    """Return the object number of each Gaussian, which is that of the clicks on it; 0 for the rest.
 
-    An object is the candidate with the largest expected IoU that has all clicks of the object and none of the others.
-    Clicks where nothing may be an object, or which no candidate has together, are logged. Raises InputError where
-    nothing was found for any of them.
+    An object is the candidate with the largest expected IoU that contains all clicks on the object and no other clicks.
+    Clicks for which there is no such candidate are logged. Raises InputError if no object is found for any click.
     """
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
     surfels, index, view = scene_surfels(scene)
@@ -65,15 +64,15 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], limits:
     if not found:
         raise InputError(f"--points {clicks[0].text!r}: there is no object at any of the points")
     labels = torch.zeros(len(surfels), dtype=torch.int64)
-    for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small ones last
+    for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small objects last
         labels[members] = number
     ids[index] = outlined(surfels, labels, scored[: len(SCALES)])
     return refine_outlines(scene, ids, device=model.input_projection.weight.device)
 
 
 def _path(scored: ScoredCandidates, distance: Float[Tensor, "n"]) -> set[int]:
-    """The candidates with the surfel at the least distance in them; none where it is beyond CLICK_REACH."""
-    leaf = torch.full((int(scored.owner.max()) + 2,), -1)  # the last is for surfels without a voxel
+    """Return the candidates that contain the surfel at the smallest `distance`; none if it is beyond CLICK_REACH."""
+    leaf = torch.full((int(scored.owner.max()) + 2,), -1)  # the last entry is for surfels without a voxel
     leaf[scored.candidates.voxels] = scored.candidates.leaf
     leaves = leaf[scored.owner]
     nearest = torch.where(leaves >= 0, distance, torch.inf).argmin()

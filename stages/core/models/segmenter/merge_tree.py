@@ -1,7 +1,7 @@
-"""Objects as nodes of a tree of merges: the tree, what is known of its nodes, and the best choice among them.
+"""Merge trees of voxels: sums and maxima over nodes, and the best set of disjoint nodes.
 
-Voxels merge by average linkage until nothing is connected; every node of the tree is a candidate. Candidates have
-scores, and the disjoint ones with the largest sum of scores are found by dynamic programming.
+Voxels are merged by average linkage until no links remain; every node of the tree is a candidate object. The disjoint
+candidates with the largest sum of scores are found by dynamic programming.
 
 Sources: Bailoni et al. 2022, "GASP, a generalized framework for agglomerative clustering of signed graphs"; Liu et al.
 2014, "A modular hierarchical approach to 3D electron microscopy image segmentation".
@@ -20,25 +20,28 @@ from stages.core.kernels.average_linkage import average_linkage
 
 @dataclass(frozen=True)
 class MergeTree:
-    """Leaves 0 ... count - 1; merge k makes node count + k of two earlier nodes."""
+    """Tree with the leaves 0 ... count - 1, in which merge k joins two earlier nodes into node count + k."""
 
     count: int
-    children: np.ndarray  # (m, 2)
-    link_sum: np.ndarray  # (m,) sum of the weights between the two
-    link_count: np.ndarray  # (m,) number of edges between them
+    children: np.ndarray  # (m, 2) nodes joined by each merge
+    link_sum: np.ndarray  # (m,) sum of the weights of the edges between the two nodes
+    link_count: np.ndarray  # (m,) number of edges between the two nodes
 
     def __len__(self) -> int:
         return self.count + len(self.children)
 
     def parents(self) -> np.ndarray:
-        """(nodes,) the node that each is merged into; -1 for roots."""
+        """Return the parent of each node, (nodes,); -1 for roots."""
         out = np.full(len(self), -1)
         out[self.children] = np.arange(self.count, len(self))[:, None]
         return out
 
     @cached_property
     def _ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The leaves (count,) in an order in which those of each node are consecutive; first and last + 1 of each."""
+        """The leaves (count,) in an order that makes each node's leaves contiguous, and the range of each node.
+
+        Ranges are given by the position of the first leaf and one past the last leaf.
+        """
         children, size = self.children.tolist(), [1] * self.count
         for a, b in children:
             size.append(size[a] + size[b])
@@ -53,21 +56,22 @@ class MergeTree:
         return start[: self.count].argsort(), start, start + sizes
 
     def sums(self, leaves: np.ndarray) -> np.ndarray:
-        """(nodes, d) sums over the leaves of each node, of values (count, d), in float64."""
+        """Sum values (count, d) of the leaves over each node: (nodes, d), in float64."""
         order, first, last = self._ranges
         return _between(leaves[order], first, last)
 
     def sums_within(self, merges: np.ndarray) -> np.ndarray:
-        """(nodes, d) sums over the merges inside each node, itself included, of values (m, d), in float64."""
+        """Sum values (m, d) of merges over the merges within each node, its own included: (nodes, d), in float64."""
         _, first, last = self._ranges
         at = np.zeros((self.count, merges.shape[1]))
-        at[first[self.children[:, 1]]] = merges  # between the leaves of the two
+        at[first[self.children[:, 1]]] = merges  # placed at the boundary between the leaves of both children
         return _between(at, first + 1, last)
 
     def maxima(self, leaves: np.ndarray) -> np.ndarray:
-        """(nodes, d) largest values of the leaves of each node, of (count, d)."""
+        """Maximum of values (count, d) of the leaves over each node: (nodes, d)."""
         order, first, last = self._ranges
-        out, window, width = np.empty((len(self), leaves.shape[1])), leaves[order], 1  # maxima of `width` from each on
+        # sparse table: `window` holds the maxima of `width` consecutive leaves
+        out, window, width = np.empty((len(self), leaves.shape[1])), leaves[order], 1
         while len(window):
             fit = (last - first >= width) & (last - first < 2 * width)
             out[fit] = np.maximum(window[first[fit]], window[last[fit] - width])
@@ -75,7 +79,7 @@ class MergeTree:
         return out
 
     def best(self, scores: np.ndarray) -> np.ndarray:
-        """The disjoint nodes with the largest sum of positive `scores` (nodes,)."""
+        """Return the disjoint nodes with the largest sum of positive `scores` (nodes,)."""
         scores, children = scores.tolist(), self.children.tolist()
         value = [max(score, 0.0) for score in scores[: self.count]]
         for score, (a, b) in zip(scores[self.count :], children, strict=True):
@@ -92,7 +96,10 @@ class MergeTree:
         return np.array(sorted(chosen), dtype=np.int64)
 
     def labels(self, nodes: np.ndarray) -> np.ndarray:
-        """(count,) the place in `nodes`, which are disjoint, of the one that holds each leaf; -1 for none."""
+        """Return for each leaf (count,) the position in `nodes`, which are disjoint, of the node that contains it.
+
+        -1 for leaves that are in none of them.
+        """
         order, first, last = self._ranges
         out = np.full(self.count, -1)
         for place, node in enumerate(nodes):
@@ -101,7 +108,7 @@ class MergeTree:
 
 
 def _between(values: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(k, d) sums of values (n, d) from `first` up to before `last`."""
+    """Sum values (n, d) over the ranges from `first` to `last` - 1: (k, d)."""
     total = np.zeros((len(values) + 1, values.shape[1]))
     np.cumsum(values, axis=0, out=total[1:])
     out = total[last]
@@ -110,9 +117,9 @@ def _between(values: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndar
 
 
 def merge_tree(count: int, pairs: np.ndarray, weights: np.ndarray) -> MergeTree:
-    """The tree of `count` leaves joined by edges `pairs` (e, 2) with log odds `weights` (e,) of belonging together.
+    """Build the tree of `count` leaves with edges `pairs` (e, 2); `weights` (e,) are log odds of belonging together.
 
-    The two nodes with the largest mean weight between them merge first; parts without an edge between them stay apart.
+    The two nodes with the largest mean weight between them are merged first; parts without an edge stay separate.
     """
     low, high = pairs.min(1), pairs.max(1)
     keys, at = np.unique(low * count + high, return_inverse=True)

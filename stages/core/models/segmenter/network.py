@@ -1,9 +1,8 @@
-"""A sparse 3D U-Net over voxels: class, offset to the object's centre, and an embedding for pairs of voxels.
+"""A sparse 3D U-Net over voxels, which predicts classes, offsets to object centres, and embeddings for pair affinities.
 
-A perceptron scores candidate objects.
-
-The classes are surface (tables, walls, floors, furniture), object, and clutter (floaters, things too small to tell).
-Offsets as in PointGroup (Jiang et al. 2020); convolutions touch occupied voxels only, as in Graham et al. 2018.
+A perceptron scores candidate objects. The classes are surface (tables, walls, floors, furniture), object, and clutter
+(floaters, objects too small to recognise). Offsets are as in PointGroup (Jiang et al. 2020); convolutions are
+restricted to occupied voxels, as in Graham et al. 2018.
 """
 
 from __future__ import annotations
@@ -18,45 +17,45 @@ from torch import Tensor, nn
 from stages.core.models.segmenter.voxels import FEATURES, VOXEL, coarser, neighbour_table
 
 CLASSES = ("surface", "object", "clutter")
-OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
-PAIR_FEATURES = 24  # of the embedding
-CANDIDATE_FEATURES = 33  # of a candidate object, see candidates.py
-BLOCK_VOXELS = 4096  # of whose neighbours a convolution holds the products at a time on a CPU
-SCORES = ("feature_", "candidate_head.")  # how the names of the weights of the scores of candidates begin
+OFFSET_UNIT = 0.1  # unit of predicted offsets [camera distance]
+PAIR_FEATURES = 24  # length of the embedding
+CANDIDATE_FEATURES = 33  # number of features of a candidate object, see candidates.py
+BLOCK_VOXELS = 4096  # voxels that a convolution processes at a time on a CPU, which bounds its memory
+SCORES = ("feature_", "candidate_head.")  # prefixes of the names of the weights that score candidates
 
 
 @dataclass(frozen=True)
 class Level:
     """Voxels of one resolution."""
 
-    neighbours: Int[Tensor, "v 27"]
-    parent: Int[Tensor, "v"]  # voxel of the next coarser level
-    children: Int[Tensor, "w 8"]  # of each voxel of the next coarser level; v where there is none
+    neighbours: Int[Tensor, "v 27"]  # see voxels.neighbour_table
+    parent: Int[Tensor, "v"]  # voxel of the next coarser level that contains each voxel
+    children: Int[Tensor, "w 8"]  # voxels within each voxel of the next coarser level; v where there is none
 
     @cached_property
     def blocks(self) -> list[NeighbourBlock]:
-        """The neighbours that exist, of BLOCK_VOXELS voxels at a time."""
+        """The existing neighbours, in blocks of BLOCK_VOXELS voxels."""
         return [NeighbourBlock.of(rows, len(self.neighbours)) for rows in self.neighbours.split(BLOCK_VOXELS)]
 
 
 @dataclass(frozen=True)
 class NeighbourBlock:
-    """The neighbours of b consecutive voxels, m in all: a third of the 27 of each, where voxels are of surfaces."""
+    """The m existing neighbours of b consecutive voxels; on surfaces these are about a third of 27 per voxel."""
 
-    sources: tuple[Int[Tensor, "_"], ...]  # the voxels at each of the 27 offsets
-    order: Int[Tensor, "m"]  # places in the list of all sources, one voxel's neighbours after the other's
-    starts: Int[Tensor, "b"]  # of each voxel in `order`
+    sources: tuple[Int[Tensor, "_"], ...]  # existing neighbours at each of the 27 offsets
+    order: Int[Tensor, "m"]  # positions in the concatenated `sources`, grouped by voxel
+    starts: Int[Tensor, "b"]  # start of each voxel's group in `order`
 
     @classmethod
     def of(cls, neighbours: Int[Tensor, "b 27"], count: int) -> NeighbourBlock:
-        """The neighbours below `count`."""
+        """Build from a table of neighbours, in which only indices below `count` exist."""
         exists = neighbours < count
         place = exists.mT.flatten().cumsum(0).view(27, -1).mT - 1
         sources, number = neighbours.mT[exists.mT].split(exists.sum(0).tolist()), exists.sum(1)
         return cls(sources, place[exists], number.cumsum(0) - number)
 
     def products(self, x: Float[Tensor, "v c"], weight: Float[Tensor, "27 c d"]) -> Float[Tensor, "b d"]:
-        """For each voxel the sum of its neighbours' features times the weights of their offsets."""
+        """Sum over the neighbours of each voxel of their features times the weights of their offsets."""
         each = x.new_empty(len(self.order), weight.shape[2])
         for rows, matrix, out in zip(self.sources, weight, each.split([len(s) for s in self.sources]), strict=True):
             torch.mm(x.index_select(0, rows), matrix, out=out)
@@ -64,7 +63,7 @@ class NeighbourBlock:
 
 
 def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
-    """The voxels at all resolutions, finest first."""
+    """Build the voxels at `levels` resolutions, finest first."""
     out = []
     for _ in range(levels):
         coarse, parent, children = coarser(cells)
@@ -74,11 +73,10 @@ def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
 
 
 class _SparseConvolution(torch.autograd.Function):
-    """x[neighbours] @ weight for a symmetric table of neighbours; the gradient gathers as well, without a scatter.
+    """x[neighbours] @ weight for a symmetric table of neighbours; the gradient uses a gather instead of a scatter.
 
-    On a GPU one product with zeros for what is absent is faster; on a CPU only neighbours that exist are multiplied.
-
-    Within `torch.autocast` the products are in its precision; the result is in that of x.
+    On a GPU one product with zeros for missing neighbours is faster; on a CPU only existing neighbours are multiplied.
+    Within `torch.autocast` products are in its precision; the result is in the precision of x.
     """
 
     @staticmethod
@@ -104,13 +102,13 @@ class _SparseConvolution(torch.autograd.Function):
 
 
 def _gather(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
-    """The features of k voxels side by side, zeros where there is none."""
+    """Concatenate the features of k voxels per row, with zeros for missing voxels."""
     padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
     return padded.index_select(0, table.flatten()).reshape(len(table), -1)
 
 
 def _pooled(x: Float[Tensor, "v c"], children: Int[Tensor, "w 8"]) -> Float[Tensor, "w c"]:
-    """The mean of the voxels in each coarser one."""
+    """Mean of the voxels within each coarser voxel."""
     count = (children < len(x)).sum(1, keepdim=True)
     return _gather(x, children).view(len(children), 8, -1).sum(1) / count
 
@@ -120,7 +118,7 @@ class Convolution(nn.Module):
 
     def __init__(self, in_channels: int, out_channels: int):
         super().__init__()
-        scale = (2 / (10 * in_channels)) ** 0.5  # about 10 of the 27 are occupied
+        scale = (2 / (10 * in_channels)) ** 0.5  # about 10 of the 27 voxels are occupied
         self.weight = nn.Parameter(scale * torch.randn(27, in_channels, out_channels))
 
     def forward(self, x: Float[Tensor, "v c"], level: Level) -> Float[Tensor, "v d"]:
@@ -128,7 +126,7 @@ class Convolution(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with a residual."""
+    """Two convolutions with a residual connection."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -146,8 +144,8 @@ class ResidualBlock(nn.Module):
 class Prediction:
     """Outputs of the network for each voxel."""
 
-    logits: Float[Tensor, "v 3"]  # of CLASSES
-    offsets: Float[Tensor, "v 3"]  # to the centre of the object [camera distance]
+    logits: Float[Tensor, "v 3"]  # logits of CLASSES
+    offsets: Float[Tensor, "v 3"]  # offset to the centre of the object [camera distance]
     embedding: Float[Tensor, "v e"]
 
 
@@ -174,7 +172,7 @@ class Segmenter(nn.Module):
         )
 
     def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
-        """Predictions for the voxels of the finest level."""
+        """Return predictions for the voxels of the finest level."""
         x = self.input_convolution(self.input_projection(features), levels[0])
         skips = []
         for depth, level in enumerate(levels):
@@ -204,6 +202,6 @@ class Segmenter(nn.Module):
         return self.affinity_head(torch.cat(inputs, 1))[:, 0]
 
     def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
-        """Log odds of the IoU of candidates with the object that they fit best."""
+        """Logit of the expected IoU of each candidate with the object that it fits best."""
         x = ((features - self.feature_mean) / self.feature_scale).clamp(-4, 4)
         return self.candidate_head(x)[:, 0]

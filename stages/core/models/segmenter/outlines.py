@@ -1,4 +1,4 @@
-"""Outlines of objects finer than a voxel: a graph cut between each object and what surrounds it."""
+"""Outlines of objects at sub-voxel resolution, by a graph cut between each object and its surroundings."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch import Tensor
 from stages.core.geometry.neighbours import knn
 from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid
 
-AROUND = 6  # voxels whose labels a surfel may take
-NEIGHBOURS = 6  # surfels that the smoothness term connects
-FLOOR = 0.02  # of a label's probability
-SMOOTHNESS = 2.0  # cost of a cut between equal neighbours [nats]
-COLOUR_SIGMA, TURN_SIGMA = 8.0, 0.5  # of the similarity of neighbours [CIELAB], [1 - cosine]
-PRECISION = 1000  # capacities are whole numbers
+AROUND = 6  # number of nearest voxels whose labels a surfel may take
+NEIGHBOURS = 6  # number of nearest surfels that the smoothness term connects a surfel to
+FLOOR = 0.02  # constant added to the probability of a label, so that its cost stays finite
+SMOOTHNESS = 2.0  # cost of a cut between neighbours of equal appearance [nats]
+COLOUR_SIGMA, TURN_SIGMA = 8.0, 0.5  # standard deviations for the similarity of neighbours [CIELAB], [1 - cosine]
+PRECISION = 1000  # integer capacities per nat
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class _Neighbourhood:
 def cut_outlines(
     surfels: ScenePoints, grid: VoxelGrid, labels: Int[Tensor, "v"], chance: Float[Tensor, "v 3"]
 ) -> Int[Tensor, "n"]:
-    """Object of each surfel, 0 for none, from those of voxels and the probabilities of their classes.
+    """Return the object of each surfel, 0 for none, from the labels and class probabilities of voxels.
 
-    A surfel takes one of the labels of the nearest voxels; one expansion move for each object, with a cost of unequal
-    neighbours that is lower across edges of colour and orientation. Source: Boykov, Veksler and Zabih 2001, "Fast
-    approximate energy minimization via graph cuts".
+    A surfel takes one of the labels of its nearest voxels. There is one expansion move per object, with a smoothness
+    cost that is lower across edges of colour and orientation. Source: Boykov, Veksler and Zabih 2001, "Fast approximate
+    energy minimization via graph cuts".
     """
     distance, index = knn(grid.points, surfels.points, min(AROUND, len(grid)))
     weight = torch.exp(-0.5 * (distance / (0.6 * VOXEL)) ** 2) + 1e-6
@@ -73,7 +73,7 @@ def cut_outlines(
 
 
 def _similarity(surfels: ScenePoints, at: Int[Tensor, "m"], neighbours: Int[Tensor, "m k"]) -> Float[Tensor, "m k"]:
-    """1 for neighbours of equal colour and orientation, less for others."""
+    """Similarity of surfels and their neighbours: about 1 for equal colour and orientation, less for others."""
     colour = (surfels.lab[at][:, None] - surfels.lab[neighbours]).norm(dim=2) / COLOUR_SIGMA
     turn = (1 - (surfels.normals[at][:, None] * surfels.normals[neighbours]).sum(2).abs()) / TURN_SIGMA
     return torch.exp(-0.5 * (colour**2 + turn**2)) + 0.05
@@ -83,9 +83,9 @@ def _expansion(
     label: int, other: Int[Tensor, "m"], to_label: Float[Tensor, "m"], to_other: Float[Tensor, "m"],
     labels: Int[Tensor, "n"], neighbourhood: _Neighbourhood,
 ) -> Bool[Tensor, "m"]:  # fmt: skip
-    """Which surfels of the neighbourhood take `label` rather than `other`: the minimum cut of an expansion move.
+    """Return which surfels of the neighbourhood take `label` rather than `other`, by the minimum cut of one move.
 
-    `to_label` and `to_other` are the probabilities of the two; `labels` those of all surfels now.
+    `to_label` and `to_other` are the probabilities of the two labels; `labels` are the current labels of all surfels.
     """
     m = len(neighbourhood.rows)
     number = torch.full((len(labels),), -1)
@@ -101,7 +101,7 @@ def _expansion(
     low = torch.minimum(cost_label, cost_other)
     source, sink = m, m + 1
     i = torch.arange(m)[:, None].expand_as(inner)[~outside]
-    j, w = inner[~outside], cut[~outside] / 2  # each pair is listed from both ends, mostly
+    j, w = inner[~outside], cut[~outside] / 2  # halved, because most pairs are listed from both ends
     heads = torch.cat([torch.full((m,), source), torch.arange(m), i, j]).numpy()
     tails = torch.cat([torch.arange(m), torch.full((m,), sink), j, i]).numpy()
     capacity = torch.cat([cost_other - low, cost_label - low, w, w])

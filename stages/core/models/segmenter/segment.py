@@ -1,4 +1,8 @@
-"""Objects of a scene by the trained network: voxels -> classes, offsets and affinities -> candidates -> Gaussians."""
+"""Segmentation of a scene by the trained network.
+
+The network predicts classes, offsets and affinities of voxels at several scales; these give a merge tree of candidate
+objects at each scale, from which the best disjoint ones are chosen and transferred to the Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -30,21 +34,22 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.schema import whole
 
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
-MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
-MAX_VOXELS = 80_000  # nearest to the focus
-OBJECT_COST = 0.45  # least IoU that a candidate must be expected to have; chosen on simulated scenes
-REDUCTIONS = (0.667, 0.444)  # of the scene, so that objects that fill the photos are as large as in the training
-LONG, MIN_LONG_IOU = 0.4, 0.8  # least length of those [camera distance], and expected IoU: kermit's pile has .72
-MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
-MIN_GAUSSIANS = 30  # of an object
-MAX_OVERLAP = 0.25  # of two objects, of the smaller
+MAX_BLOCKS, MAX_LEVELS = 100, 12  # largest numbers of blocks and levels of a network
+MAX_VOXELS = 80_000  # largest number of voxels; those nearest to the focus are kept
+OBJECT_COST = 0.45  # smallest expected IoU of a candidate to be chosen; tuned on simulated scenes
+REDUCTIONS = (0.667, 0.444)  # scale factors at which objects that fill the photos are as large as in training
+# Smallest length [camera distance] and expected IoU of objects found in a reduced scene; the pile of `kermit` has .72.
+LONG, MIN_LONG_IOU = 0.4, 0.8
+MAX_SIZE = 0.6  # longest side of an object, that of the largest in training [camera distance]
+MIN_GAUSSIANS = 30  # smallest number of Gaussians of an object
+MAX_OVERLAP = 0.25  # largest overlap of two objects, as a fraction of the smaller one
 TURNS = (((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 1, 0), (1, 0, 0), (0, 0, 1)),
          ((-1, 0, 0), (0, -1, 0), (0, 0, 1)), ((0, -1, 0), (-1, 0, 0), (0, 0, 1)))  # fmt: skip
-COPIES = len(TURNS)  # of the scene whose predictions are averaged
+COPIES = len(TURNS)  # copies of the scene whose predictions are averaged
 
 
 def find(given: Path | None = None) -> Path:
-    """The weights: `given`, else in $NGFF_WEIGHTS, else those in the package; InputError if there are none."""
+    """Find the weights: `given`, else in $NGFF_WEIGHTS, else in the package; InputError if there are none."""
     folder = os.environ.get("NGFF_WEIGHTS")
     places = [given] if given is not None else [*([Path(folder) / WEIGHTS.name] if folder else []), WEIGHTS]
     found = next((Path(p) for p in places if Path(p).is_file()), None)
@@ -55,10 +60,11 @@ def find(given: Path | None = None) -> Path:
 
 
 def load_segmenter(path: Path, device: torch.device | str = "cpu", new_scores: bool = False) -> Segmenter:
-    """The network with its trained weights, in single precision.
+    """Load the network with its trained weights, in single precision.
 
-    `new_scores`: where the scores of candidates are of other features than today's they are begun anew, for training.
-    Raises InputError for weights that are missing, damaged or do not fit their card.
+    With `new_scores`, which is for training, the part that scores candidates is reinitialised if its weights are for
+    other features than the current ones. Raises InputError for weights that are missing, damaged or do not fit their
+    card.
     """
     must_exist(path, "weights (.safetensors) such as `ngff-lab train-segmenter` writes")
     card = read_card(path, ("segmenter",))
@@ -66,7 +72,7 @@ def load_segmenter(path: Path, device: torch.device | str = "cpu", new_scores: b
     try:
         blocks, widths = whole(card["config"]["blocks"], "blocks", 1, MAX_BLOCKS), card["config"]["widths"]
         widths = tuple(whole(width, "widths", 1, MAX_CONFIG) for width in widths[:MAX_LEVELS])
-        if blocks * sum(w * w for w in widths) > sum(v.numel() for v in state.values()):  # before it takes memory
+        if blocks * sum(w * w for w in widths) > sum(v.numel() for v in state.values()):  # before memory is allocated
             raise ValueError("the card is of a larger network")
         model = Segmenter(widths, blocks)
         own = {name: value for name, value in model.state_dict().items() if name.startswith(SCORES)}
@@ -85,9 +91,9 @@ def segment_by_network(
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> Scene:
-    """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
+    """Return the scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    `seed` is of the search for the supporting surface; the network runs and the views are drawn on `device`. Raises
+    `seed` is for the search for the supporting surface; the network and the rendering of views run on `device`. Raises
     InputError if there are no weights at `weights`.
     """
     support = find_support(scene, view_extent(scene), seed)
@@ -101,7 +107,7 @@ def object_ids(
     model: Segmenter,
     limits: ObjectLimits = ObjectLimits(),  # noqa: B008
 ) -> Int[Tensor, "n"]:
-    """Object number of each Gaussian; 0 for the rest."""
+    """Return the object number of each Gaussian; 0 for Gaussians of no object."""
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
@@ -118,26 +124,26 @@ def object_ids(
 
 @dataclass(frozen=True)
 class Segmentation:
-    """The best choice of objects at one scale."""
+    """The objects chosen at one scale."""
 
-    labels: Int[Tensor, "n"]  # of surfels: row of `gains`, -1 for none
-    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST, times surfels
-    sizes: Int[Tensor, "k"]  # surfels
+    labels: Int[Tensor, "n"]  # object (row of `gains`) of each surfel; -1 for none
+    gains: Float[Tensor, "k"]  # (expected IoU - OBJECT_COST) x number of surfels
+    sizes: Int[Tensor, "k"]  # number of surfels
 
 
 @dataclass(frozen=True)
 class ScoredCandidates:
-    """Candidate objects at one scale, and how well each is expected to fit an object."""
+    """Candidate objects at one scale, and the expected IoU of each with an object."""
 
     candidates: Candidates
-    ious: Float[Tensor, "k"]  # expected
+    ious: Float[Tensor, "k"]  # expected IoU
     extents: Float[Tensor, "k"]  # longest side along the axes [camera distance]
     scale: float
-    owner: Int[Tensor, "n"]  # voxel of each surfel, -1 beyond MAX_VOXELS
-    chance: Float[Tensor, "n 3"]  # of the classes, of each surfel; NaN beyond MAX_VOXELS
+    owner: Int[Tensor, "n"]  # voxel of each surfel; -1 beyond MAX_VOXELS
+    chance: Float[Tensor, "n 3"]  # class probabilities of each surfel; NaN beyond MAX_VOXELS
 
     def usable(self, min_size: float) -> Bool[Tensor, "k"]:
-        """Which candidates are neither too small nor too large."""
+        """Mask of candidates that are neither too small nor too large; in reduced scenes also MIN_LONG_IOU applies."""
         many = self.candidates.sizes > MIN_VOXELS - 0.5
         if self.scale >= 1:
             return many & (self.extents >= min_size) & (self.extents <= MAX_SIZE)
@@ -145,15 +151,15 @@ class ScoredCandidates:
         return many & long & (self.ious >= MIN_LONG_IOU)
 
     def labels(self, nodes: np.ndarray) -> Int[Tensor, "n"]:
-        """The place in `nodes`, which are disjoint, of the one that holds each surfel; -1 for none."""
-        own = torch.full((int(self.owner.max()) + 2,), -1)  # the last is for surfels without a voxel
+        """Return for each surfel the position in `nodes` (disjoint) of the node that contains it; -1 for none."""
+        own = torch.full((int(self.owner.max()) + 2,), -1)  # the last entry is for surfels without a voxel
         own[self.candidates.voxels] = torch.from_numpy(self.candidates.tree.labels(nodes))[self.candidates.leaf]
         return own[self.owner]
 
     def expected_ious(self, objects: Segmentation) -> Float[Tensor, "k"]:
-        """The IoU that each of some objects is expected to have by the candidates of this scale.
+        """Return the expected IoU of given objects according to the candidates of this scale.
 
-        That is the IoU with a candidate times the one that this is expected to have, where the product is largest.
+        It is the largest product, over all candidates, of the IoU with the candidate and the candidate's expected IoU.
         """
         count, inside = int(self.owner.max()) + 1, self.owner >= 0
         both = inside & (objects.labels >= 0)
@@ -166,10 +172,11 @@ class ScoredCandidates:
         return expected.amax(0).float()
 
     def best(self, limits: ObjectLimits) -> Segmentation:
-        """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by surfels.
+        """Choose disjoint candidates with the largest sum of (expected IoU - OBJECT_COST) x number of surfels.
 
-        That is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical image
-        segmentation"; without weights two parts of an object, each half as good, count as much as the object.
+        This corresponds to the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical image
+        segmentation". Without the weights, two parts of an object, each half as good, would score as much as the
+        object.
         """
         count = int(self.owner.max()) + 1
         surfels = torch.bincount(self.owner[self.owner >= 0], minlength=count)
@@ -181,7 +188,10 @@ class ScoredCandidates:
 
 
 def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCandidates:
-    """Candidate objects among the surfels enlarged by `scale`, those nearest to the focus where there are many."""
+    """Find and score candidate objects among the surfels enlarged by `scale`.
+
+    Only the MAX_VOXELS voxels nearest to the focus are used.
+    """
     scaled = surfels.enlarged(scale).to(model.input_projection.weight.device)
     near = torch.ones(len(surfels), dtype=torch.bool)
     grid = voxelise(scaled)
@@ -190,7 +200,7 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
         within = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
         scaled, near = scaled[within], within.cpu()
         grid = voxelise(scaled)
-    # with one copy of the reduced scene the same objects were found as with all, see lab/results/segment.md
+    # one copy of a reduced scene is enough: the same objects were found as with all copies, see lab/results/segment.md
     levels, found = averaged_prediction(scaled, grid, model, COPIES if scale >= 1 else 1)
     candidates = find_candidates(grid, levels, found, model)
     ious = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
@@ -203,10 +213,10 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
 def averaged_prediction(
     surfels: ScenePoints, grid: VoxelGrid, model: Segmenter, copies: int = COPIES
 ) -> tuple[list[Level], Prediction]:
-    """The levels of the voxels `grid` of the surfels, and the mean of the predictions for `copies` of the scene.
+    """Return the levels of the voxels `grid`, and the predictions averaged over `copies` of the scene.
 
-    The copies are mirrored in both diagonals or given a half turn, and moved by parts of a voxel. The network is
-    trained on such, but neither it nor the division into voxels is symmetric.
+    Copies are mirrored in the diagonals or rotated by a half turn, and shifted by fractions of a voxel. The network is
+    trained with such transformations, but neither the network nor the voxel grid is symmetric.
     """
     count, device = len(model.config["widths"]), grid.points.device
     levels = pyramid(grid.cells, count)
@@ -224,18 +234,20 @@ def averaged_prediction(
 
 
 def confirmed(objects: Segmentation, scored: ScoredCandidates) -> Segmentation:
-    """Those objects of a reduced scene of which the mean of the expected IoU and that at the scale of `scored` is at
-    least MIN_LONG_IOU: reduced, things that are near each other look like one.
+    """Select the objects of a reduced scene that the candidates at the scale of `scored` confirm.
+
+    The mean of the expected IoU in the reduced scene and at that scale must be at least MIN_LONG_IOU, since in a
+    reduced scene objects near each other look like a single one.
     """
     iou = (objects.gains / objects.sizes + OBJECT_COST + scored.expected_ious(objects)) / 2
     kept = torch.nonzero(iou >= MIN_LONG_IOU)[:, 0]
-    row = torch.full((len(iou) + 1,), -1)  # the last is for surfels of no object
+    row = torch.full((len(iou) + 1,), -1)  # the last entry is for surfels of no object
     row[kept] = torch.arange(len(kept))
     return Segmentation(row[objects.labels], objects.gains[kept], objects.sizes[kept])
 
 
 def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[ScoredCandidates]) -> Int[Tensor, "n"]:
-    """Object of each surfel, 0 for none, after the cut along the outlines of the objects `labels`."""
+    """Return the object of each surfel, 0 for none, after refining the outlines of the objects `labels`."""
     chance = torch.stack([s.chance for s in scored]).nanmean(0)
     fine = surfels.enlarged(SCALES[-1])
     grid = voxelise(fine, features=False)
@@ -243,10 +255,10 @@ def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[Sc
 
 
 def best_objects(found: Sequence[Segmentation]) -> Int[Tensor, "n"]:
-    """Object of each surfel, 1 for the largest and 0 for none: the best choice among the objects of all scales.
+    """Choose among the objects of all scales; return the object of each surfel, 1 for the largest and 0 for none.
 
-    No two overlap by more than MAX_OVERLAP of the smaller, and the sum of their gains is the largest (found by integer
-    linear programming).
+    Maximises the sum of gains, such that no two objects overlap by more than MAX_OVERLAP of the smaller one, by integer
+    linear programming.
     """
     first = [0, *itertools.accumulate(len(f.gains) for f in found)]
     gains, sizes = torch.cat([f.gains for f in found]), torch.cat([f.sizes for f in found])
@@ -264,14 +276,14 @@ def best_objects(found: Sequence[Segmentation]) -> Int[Tensor, "n"]:
 
 
 def _shared(a: Segmentation, b: Segmentation) -> Int[Tensor, "x y"]:
-    """Surfels that each object of `a` shares with each of `b`."""
+    """Number of surfels that each object of `a` shares with each object of `b`."""
     both = (a.labels >= 0) & (b.labels >= 0)
     number = a.labels[both] * len(b.gains) + b.labels[both]
     return torch.bincount(number, minlength=len(a.gains) * len(b.gains)).view(len(a.gains), len(b.gains))
 
 
 def _best_without(conflicts: list[tuple[int, int]], gains: np.ndarray) -> np.ndarray:
-    """1 for what is chosen and 0 for the rest, so that of two in conflict at most one is chosen."""
+    """Return 1 for chosen and 0 for other objects; of two objects in conflict at most one is chosen."""
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     rows = np.zeros((len(conflicts), len(gains)))
@@ -283,7 +295,7 @@ def _best_without(conflicts: list[tuple[int, int]], gains: np.ndarray) -> np.nda
 def _by_voxel(
     grid: VoxelGrid, labels: Int[Tensor, "n"], chance: Float[Tensor, "n 3"]
 ) -> tuple[Int[Tensor, "v"], Float[Tensor, "v 3"]]:
-    """The label that most surfels of each voxel have, and their mean probabilities."""
+    """Return the most frequent label of the surfels in each voxel, and their mean class probabilities."""
     count, kinds = len(grid), int(labels.max()) + 1
     most = torch.bincount(grid.owner * kinds + labels, minlength=count * kinds).view(count, kinds).argmax(1)
     known = chance.nan_to_num(1 / 3)

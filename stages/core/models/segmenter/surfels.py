@@ -1,4 +1,4 @@
-"""Inputs of the segmentation network from the Gaussians of a scene."""
+"""Surfels of a scene's Gaussians: the inputs of the segmentation network."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-NO_FLOOR_QUANTILE = 0.05  # of heights in reach, taken as the floor where the scene has none
+NO_FLOOR_QUANTILE = 0.05  # quantile of the heights in reach that is taken as the floor if the scene has none
 
 
 def scene_surfels(scene: Scene) -> tuple[ScenePoints, Int[Tensor, "n"], ViewExtent]:
-    """The surfels of a scene in reach of the cameras' focus, the indices of their Gaussians, and the unit of length."""
+    """Return the surfels of a scene within reach of the cameras' focus, their Gaussians' indices, and the view extent.
+
+    The view extent gives the origin (`focus`) and the unit of length (`radius`) of the surfels.
+    """
     g, view = scene.gaussians, view_extent(scene)
     local = (g.means - view.focus) / view.radius
     size = g.scales.amax(1) / view.radius
@@ -38,10 +41,10 @@ def scene_surfels(scene: Scene) -> tuple[ScenePoints, Int[Tensor, "n"], ViewExte
 
 
 def cielab(g: Gaussians) -> Float[Tensor, "n 3"]:
-    """Base colours (degree 0 of the spherical harmonics) in CIELAB."""
+    """Convert base colours (degree 0 of the spherical harmonics) to CIELAB."""
     return cielab_of((g.sh[:, 0] * C0 + 0.5).nan_to_num(0.5))
 
 
 def cielab_of(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """sRGB 0..1 in CIELAB."""
+    """Convert sRGB in 0..1 to CIELAB."""
     return torch.from_numpy(cv2.cvtColor(rgb.clamp(0, 1).numpy().astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0])

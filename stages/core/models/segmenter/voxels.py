@@ -1,7 +1,7 @@
-"""Gaussians of a scene as voxels with features, the input of the segmentation network.
+"""Voxels with features from the Gaussians of a scene, the input of the segmentation network.
 
-Lengths are in units of the distance of the cameras from what they look at, so that the network sees scenes of any size
-alike.
+Lengths are in units of the distance of the cameras from their common focus, so that the network is independent of the
+size of a scene.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from stages.core.geometry.rotations import matrix
 from stages.core.geometry.symmetric_matrices import eigh
 from stages.core.scene.gaussians import SURFACE_OPACITY
 
-VOXEL = 0.01  # side [camera distance]
-SCALES = (1.0, 1.5, 2.25)  # by which scenes are enlarged in turn, so that objects of all sizes are many voxels
-REACH = 1.5  # Gaussians farther from the focus are left out [camera distance]
-MAX_SCALE = 0.1  # standard deviation above which a Gaussian is a backdrop [camera distance]
-NORMAL_NEIGHBOURS = 16
-FEATURES, LAB = 11, slice(6, 9)  # of a voxel, and which of them are its colour
+VOXEL = 0.01  # side of a voxel [camera distance]
+SCALES = (1.0, 1.5, 2.25)  # factors by which scenes are enlarged, so that objects of all sizes span many voxels
+REACH = 1.5  # Gaussians farther from the focus are ignored [camera distance]
+MAX_SCALE = 0.1  # Gaussians with a larger standard deviation are ignored as backdrops [camera distance]
+NORMAL_NEIGHBOURS = 16  # voxels to which a normal is fitted
+FEATURES, LAB = 11, slice(6, 9)  # number of features of a voxel, and the columns of its colour
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ScenePoints:
     lab: Float[Tensor, "n 3"]  # CIELAB
     normals: Float[Tensor, "n 3"]  # shortest axis, not oriented
     flatness: Float[Tensor, "n"]  # 0 for a ball, 1 for a disc
-    toward: Float[Tensor, "n 3"]  # summed unit directions to the cameras that show it; 0: not seen
+    toward: Float[Tensor, "n 3"]  # sum of unit directions to the cameras that see the Gaussian; 0: not seen
 
     def __len__(self) -> int:
         return len(self.points)
@@ -42,15 +42,15 @@ class ScenePoints:
         return ScenePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def to(self, device: torch.device | str) -> ScenePoints:
-        """The same on another device."""
+        """Return a copy on another device."""
         return ScenePoints(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
     def enlarged(self, scale: float) -> ScenePoints:
-        """The same with `scale` times the lengths."""
+        """Return a copy with positions multiplied by `scale`."""
         return replace(self, points=scale * self.points)
 
     def turned(self, R: Float[Tensor, "3 3"]) -> ScenePoints:
-        """The same turned or mirrored about the focus."""
+        """Return a copy rotated or mirrored about the focus."""
         points, normals, toward = (v @ R.mT for v in (self.points, self.normals, self.toward))
         return replace(self, points=points, normals=normals, toward=toward)
 
@@ -68,22 +68,22 @@ class VoxelGrid:
         return len(self.cells)
 
     def means(self, values: Float[Tensor, "n *c"]) -> Float[Tensor, "v *c"]:
-        """Means over the surfels of each voxel."""
+        """Mean of values over the surfels of each voxel."""
         return _means(values, self.owner.argsort(stable=True), torch.bincount(self.owner, minlength=len(self)))
 
     @property
     def lab(self) -> Float[Tensor, "v 3"]:
-        """Mean colours in CIELAB, scaled as the network takes them."""
+        """Mean colours in CIELAB, scaled as network inputs."""
         return self.features[:, LAB]
 
 
 def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Direction of each Gaussian's shortest axis: the normal of a flat one."""
+    """Direction of each Gaussian's shortest axis, which is the normal of a flat Gaussian."""
     return matrix(quats)[torch.arange(len(quats)), :, scales.argmin(1)]
 
 
 def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None, features: bool = True) -> VoxelGrid:
-    """The voxels of a scene, with no features where `features` is False; `shift` moves the grid, for training."""
+    """Voxelise a scene, without features if `features` is False; `shift` moves the surfels relative to the grid."""
     cell = (surfels.points + (0 if shift is None else shift)).div(VOXEL).floor().long()
     cells, owner, count = unique_cells(cell)
     order = owner.argsort(stable=True)
@@ -101,7 +101,7 @@ def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None, feat
 
 
 def _means(values: Float[Tensor, "n *c"], order: Int[Tensor, "n"], count: Int[Tensor, "v"]) -> Float[Tensor, "v *c"]:
-    """Means over groups of rows, those of one group together in `order`; summed in this order, on a GPU too."""
+    """Means over groups of rows that are contiguous in `order`; summed in this order, so reproducible on a GPU."""
     total = torch.segment_reduce(values[order].flatten(1), "sum", lengths=count, axis=0)
     return (total / count[:, None]).reshape(-1, *values.shape[1:])
 
@@ -111,7 +111,7 @@ def _outer(v: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 
 
 def _normals(points: Tensor, axes: Float[Tensor, "v 3 3"], toward: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
-    """Unit normals from the shortest axes of Gaussians and the planes of neighbours, towards the cameras or up."""
+    """Unit normals from the shortest axes of Gaussians and planes through neighbours, towards the cameras or up."""
     k = min(NORMAL_NEIGHBOURS, len(points))
     around = points[knn(points, points, k)[1]]
     centred = around - around.mean(1, keepdim=True)
@@ -123,9 +123,9 @@ def _normals(points: Tensor, axes: Float[Tensor, "v 3 3"], toward: Float[Tensor,
 
 
 def neighbour_table(cells: Int[Tensor, "v 3"]) -> Int[Tensor, "v 27"]:
-    """Index of the voxel at each of the 27 offsets -1..1 of every voxel, v where there is none.
+    """Index of the voxel at each of the 27 offsets -1..1 from every voxel; v where there is none.
 
-    Column k is offset (k // 9, k // 3 % 3, k % 3) - 1, so that column 26 - k is the opposite one.
+    Column k is for offset (k // 9, k // 3 % 3, k % 3) - 1, so that column 26 - k is for the opposite offset.
     """
     count, own = len(cells), _keys(cells)
     keys, order = own.sort()
@@ -141,20 +141,23 @@ def neighbour_table(cells: Int[Tensor, "v 3"]) -> Int[Tensor, "v 27"]:
 
 
 def _keys(cells: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
-    """One number for each cell, of coordinates within 2^20."""
+    """Unique integer key of each cell, for coordinates within +-2^20."""
     x, y, z = (cells + (1 << 20)).unbind(-1)
     return (x << 42) | (y << 21) | z
 
 
 def unique_cells(cells: Int[Tensor, "n 3"]) -> tuple[Int[Tensor, "v 3"], Int[Tensor, "n"], Int[Tensor, "v"]]:
-    """The distinct cells, that of each row, and the number of rows of each."""
+    """Return the distinct cells, the cell of each row, and the number of rows in each cell."""
     keys, owner, count = _keys(cells).unique(return_inverse=True, return_counts=True)
     low = (1 << 21) - 1
     return torch.stack([keys >> 42, (keys >> 21) & low, keys & low], 1) - (1 << 20), owner, count
 
 
 def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, "v"], Int[Tensor, "w 8"]]:
-    """The voxels of twice the side, that of each voxel, and the voxels in each (v where there is none)."""
+    """Return the voxels of twice the side, the coarse voxel of each voxel, and the voxels in each coarse voxel.
+
+    Missing voxels have index v.
+    """
     up, owner, _ = unique_cells(cells >> 1)
     children = torch.full((len(up), 8), len(cells), device=cells.device)
     x, y, z = (cells & 1).unbind(1)
@@ -165,6 +168,6 @@ def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, 
 def within_reach(
     points: Float[Tensor, "n 3"], opacity: Float[Tensor, "n"], size: Float[Tensor, "n"]
 ) -> Bool[Tensor, "n"]:
-    """Which Gaussians the network takes as inputs; lengths in camera distances about the focus."""
+    """Mask of Gaussians that are network inputs; lengths are in camera distances, relative to the focus."""
     finite = points.isfinite().all(1) & size.isfinite()
     return finite & (points.norm(dim=1) < REACH) & (opacity > SURFACE_OPACITY) & (size < MAX_SCALE)

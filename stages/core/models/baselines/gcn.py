@@ -13,12 +13,12 @@ from stages.core.models.dynamics import FRAME, PointDynamics, PointState, movabl
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions
 
-RADIUS = 0.1  # of the graph, across objects [m]
+RADIUS = 0.1  # points closer than this are connected, also across objects [m]
 
 
 @torch.no_grad()
 def adjacency(points: Float[Tensor, "b p 3"], valid: Bool[Tensor, "b p"]) -> Float[Tensor, "b p p"]:
-    """D^-1/2 (A + I) D^-1/2 of the radius graph, D being the degrees of A + I; 0 where padded."""
+    """D^-1/2 (A + I) D^-1/2 of the radius graph, with the degrees D of A + I; 0 where padded."""
     x = points - points.mean(1, keepdim=True)
     with torch.autocast(x.device.type, enabled=False):
         squared = x.float().square().sum(-1)
@@ -39,12 +39,15 @@ class GraphConv(nn.Module):
         nn.init.xavier_uniform_(self.linear.weight)
 
     def forward(self, x: Float[Tensor, "b p w"], A: Float[Tensor, "b p p"]) -> Float[Tensor, "b p v"]:
-        """Node features `x` -> A x W^T + b; `A` from `adjacency`."""
+        """Return A x W^T + b for node features `x`; `A` is from `adjacency`."""
         return A.to(x) @ self.linear(x) + self.bias
 
 
 class GCN(PointDynamics):
-    """Engine `gcn`: change of positions and velocities per FRAME, from the current graph; applied as a rate."""
+    """Engine `gcn`: predicts the change of positions and velocities per FRAME from the current graph.
+
+    The change is applied as a rate.
+    """
 
     inputs = frozenset({"points", "velocity", "spin"})
 
@@ -58,7 +61,7 @@ class GCN(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
-        """Rates [m/s, m/s^2] from the current radius graph and external forces; 0 for points that may not move."""
+        """Return rates [m/s, m/s^2] from the current radius graph and external forces; 0 for immovable points."""
         position = state.position.flatten(1, 2)
         A = adjacency(position, initial.valid.flatten(1))
         x = torch.cat([position, state.velocity.flatten(1, 2)], -1)

@@ -1,8 +1,8 @@
 """The published neural Gaussian force field, with its parameter names, so that its checkpoints load.
 
 Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code.
-Details of that code that its checkpoints depend on are kept and noted in place. Two are not: the neighbour search has
-no cap, and padding does not enter the object encoder (`padding_encoded` restores that).
+Details of that code on which its checkpoints depend are kept and noted in place, with two exceptions: the neighbour
+search has no cap, and padding does not enter the object encoder (`padding_encoded` restores the published behaviour).
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from stages.core.models.field.narrow_phase import near_walls, nearest
 from stages.core.models.field.rigid_body import fit_rigid_motion
 from stages.core.models.initial_conditions import GRAVITY, InitialConditions, centre_of_mass, inertia, offsets
 
-MASS = 0.1  # of every object [kg]
-CONTACT_RADIUS = 0.05  # closer points are in contact [m]
-BLOCK_POINTS = 768  # that a CPU thread computes at a time: of 512 to 1536 the fastest (Intel Xeon, two cores)
+MASS = 0.1  # mass of every object [kg]
+CONTACT_RADIUS = 0.05  # points closer than this are in contact [m]
+BLOCK_POINTS = 768  # points that a CPU thread processes at a time: fastest of 512 to 1536 (Intel Xeon, two cores)
 
 
 class PaperState(NamedTuple):
-    """Objects as local points, centre of mass and Euler angles."""
+    """State of objects: local points, centre of mass and Euler angles."""
 
     local: Float[Tensor, "b o n 3"]  # keypoints relative to the centre of mass, before rotation [m]
     local_velocity: Float[Tensor, "b o n 3"]  # [m/s]
     com: Float[Tensor, "b o 3"]  # [m]
     velocity: Float[Tensor, "b o 3"]  # [m/s]
     angle: Float[Tensor, "b o 3"]  # about x, y, z, applied in this order [rad]
-    rate: Float[Tensor, "b o 3"]  # of the Euler angles, not an angular velocity vector [rad/s]
+    rate: Float[Tensor, "b o 3"]  # time derivatives of the Euler angles, not an angular velocity vector [rad/s]
 
 
 def blocks(count: int, inner: int, outer: int) -> list[nn.Module]:
@@ -81,16 +81,16 @@ def angle_rates(angle: Float[Tensor, "*b 3"], spin: Float[Tensor, "*b 3"]) -> Fl
 
 
 def _blocks(x: Shaped[Tensor, "b o n *c"]) -> tuple[Tensor, ...]:
-    """All points or, on a CPU without gradients, about BLOCK_POINTS at a time."""
+    """Split the points into blocks of about BLOCK_POINTS on a CPU without gradients; otherwise return one block."""
     if x.is_cuda or torch.is_grad_enabled():
         return (x,)
     return x.split(max(1, BLOCK_POINTS // max(1, x.shape[0] * x.shape[1])), 2)
 
 
 def _map_blocks(function: Callable, *blocks: Sequence) -> list:
-    """Results of a function for each block of points, which several CPU threads compute in parallel.
+    """Apply a function to each block of points, in parallel on several CPU threads.
 
-    PyTorch's own threads would wait for each other after each operation.
+    PyTorch's own threads would synchronise after each operation.
     """
     arguments = list(zip(*blocks, strict=True))
     if len(arguments) == 1:
@@ -100,7 +100,7 @@ def _map_blocks(function: Callable, *blocks: Sequence) -> list:
 
 
 def _maximum(x: Float[Tensor, "b o m h"], counts: Bool[Tensor, "b o m"]) -> Float[Tensor, "b o h"]:
-    """Maximum over the points in `counts`, -inf where there are none."""
+    """Maximum over the points where `counts` is true, -inf if there are none."""
     return x.masked_fill(~counts[..., None], -torch.inf).amax(2)
 
 
@@ -112,7 +112,7 @@ class ResidualLinear(nn.Module):
         self.mlp = nn.Sequential(*blocks(1, width, width))
 
     def forward(self, x: Float[Tensor, "*b w"]) -> Float[Tensor, "*b w"]:
-        """Input plus its transformed copy, same width."""
+        """Return the input plus its transformed copy, of the same width."""
         return x + self.mlp(x)
 
 
@@ -126,7 +126,7 @@ class ObjectEncoder(nn.Module):
         self.global_features = nn.Sequential(*blocks(1, hidden, hidden))
 
     def forward(self, local: Float[Tensor, "b o n 3"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o h"]:
-        """Maximum-pooled embedding of the `local` points [m] in `counts`; objects without points pool to 0."""
+        """Max-pooled embedding of the `local` points [m] where `counts` is true; objects without points pool to 0."""
         maxima = _map_blocks(self._block_maximum, _blocks(local), _blocks(counts))
         maximum = torch.stack(maxima).amax(0)
         return self.global_features(torch.where(counts.any(2, keepdim=True), maximum, 0.0))
@@ -145,16 +145,16 @@ class StressNet(nn.Module):
         super().__init__()
         h = hidden
         self.feature_layer = _perceptron(12, h, h)
-        self.output_layer = _perceptron(2 * h, h, 3)  # of a point's features and their maximum over the object
+        self.output_layer = _perceptron(2 * h, h, 3)  # input: a point's features and their maximum over the object
 
     def forward(self, x: Float[Tensor, "b o n 12"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o n 3"]:
-        """Accelerations [m/s^2] from each point's features and their maximum over the points in `counts`."""
+        """Accelerations [m/s^2] from each point's features and their maximum over the points where `counts` is true."""
         blocks = _map_blocks(self._features, _blocks(x), _blocks(counts))
         maximum = torch.stack([maximum for _, maximum in blocks]).amax(0)
         maximum = torch.where(counts.any(2, keepdim=True), maximum, 0.0)
         first, *others = self.output_layer
         own, shared = first.weight.chunk(2, 1)
-        offset = linear(maximum, shared, first.bias)[:, :, None]  # once for an object instead of for each point
+        offset = linear(maximum, shared, first.bias)[:, :, None]  # once per object instead of per point
 
         def output(x: Tensor, _: Tensor) -> Tensor:
             x = linear(x, own).add_(offset)
@@ -189,9 +189,9 @@ class Predictor(nn.Module):
     def forward(
         self, initial: InitialConditions, state: PaperState, rest: Float[Tensor, "b o n 3"]
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"], Float[Tensor, "b o n 3"]]:
-        """Force [N], torque [N m], acceleration of the points in the object [m/s^2] (0 without deformation).
+        """Return force [N], torque [N m], and acceleration of the local points [m/s^2] (0 without deformation).
 
-        `rest`: local points at time 0 [m].
+        `rest` are the local points at time 0 [m].
         """
         counts = torch.ones_like(initial.valid) if self.padding_encoded else initial.valid
         points = world_points(state)
@@ -212,7 +212,7 @@ class Predictor(nn.Module):
         return force, torque, self.stress_net(x, counts)
 
     def _pairs(self, shape: Float[Tensor, "b o h"], state: PaperState) -> Float[Tensor, "b o o 9"]:
-        """Force, torque and latent of object i by object j."""
+        """Force, torque and latent vector of object i due to object j."""
         s = _placement(state)
         o = shape.shape[1]
         relative = self.state_embedding(s[:, :, None] - s[:, None])
@@ -222,7 +222,10 @@ class Predictor(nn.Module):
     def _floor(
         self, shape: Float[Tensor, "b o h"], state: PaperState, initial: InitialConditions
     ) -> Float[Tensor, "b o 9"]:
-        """Force, torque and latent of an object by the room; inputs: floor height, and walls only through contact."""
+        """Force, torque and latent vector of an object due to the room.
+
+        The input includes the height of the floor; walls enter only through contact.
+        """
         floor = torch.zeros_like(state.com)
         floor[..., 2] = initial.floor
         s = _placement(state._replace(com=state.com - floor))
@@ -257,7 +260,7 @@ class PaperForceField(Dynamics):
         self.register_buffer("gravity", torch.tensor(GRAVITY[2]))
 
     def initial_state(self, initial: InitialConditions) -> PaperState:
-        """Undeformed, with zero angles; angular velocities are taken as their rates."""
+        """Return undeformed objects with zero angles; angular velocities are taken as angle rates."""
         com = centre_of_mass(initial, initial.points)
         local = _rest(initial)
         return PaperState(local, torch.zeros_like(local), com, initial.velocity, torch.zeros_like(com), initial.spin)
@@ -265,7 +268,7 @@ class PaperForceField(Dynamics):
     def state_from_motion(
         self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"]
     ) -> PaperState:
-        """Rigid motion fitted to the keypoints, as Euler angles and their rates; the residual is the deformation."""
+        """Fit a rigid motion to the keypoints, as Euler angles and their rates; the residual is the deformation."""
         arm = offsets(initial, initial.points)
         inverse = torch.linalg.inv(inertia(initial.mass_fraction, arm))
         m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, velocities)
@@ -276,10 +279,10 @@ class PaperForceField(Dynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
     ) -> PaperState:
-        """Rates of the state from predicted and external forces and gravity; 0 for padding and pinned objects."""
+        """Return rates of the state by predicted and external forces and gravity; 0 for padding and pinned objects."""
         if initial.points.is_cuda or torch.is_grad_enabled():
             return self._rates(initial, t, state, external)
-        with small_operations():  # all but those on blocks of points
+        with small_operations():  # except those on blocks of points
             return self._rates(initial, t, state, external)
 
     def _rates(

@@ -1,4 +1,4 @@
-"""The published transformer baseline: attention between all keypoints, from their positions alone."""
+"""The published transformer baseline: attention between all keypoints, with only their positions as input."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from stages.core.models.initial_conditions import InitialConditions
 
 
 class Pointformer(PointDynamics):
-    """Engine `pointformer`: change of positions per FRAME, applied as a velocity.
+    """Engine `pointformer`: predicts the change of positions per FRAME, which is applied as a velocity.
 
-    The published model has no velocity input. Here the velocity of the state is that of the initial conditions plus
-    the impulses of external forces; it is added to the network's output, which does not reduce it.
+    The published model has no velocity input. Here the velocity of the state, which is that of the initial conditions
+    plus the impulses of external forces, is added to the network's output; the network cannot change it.
     """
 
     inputs = frozenset({"points", "velocity", "spin"})
@@ -31,7 +31,7 @@ class Pointformer(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
-        """Network output plus velocity [m/s], and external accelerations [m/s^2]; 0 for points that may not move."""
+        """Return network output plus velocity [m/s], and external accelerations [m/s^2]; 0 for immovable points."""
         x = self.embed(state.position.flatten(1, 2))
         padding = ~initial.valid.flatten(1)
         for block in self.blocks:

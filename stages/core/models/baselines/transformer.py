@@ -1,6 +1,6 @@
 """A transformer baseline with the inputs of `ngff` but none of its built-in physics.
 
-Layers attend within objects and over the whole scene in turn; the output is accelerations.
+Layers attend alternately within objects and over the whole scene; the outputs are accelerations.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from stages.core.models.dynamics import PointDynamics, PointState, movable
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass, offsets
 
-ACCELERATION_UNIT = 20.0  # acceleration of a network output of 1 [m/s^2]
-WALL_RANGE = 0.1  # distances to walls are clipped to it [m]
+ACCELERATION_UNIT = 20.0  # acceleration represented by a network output of 1 [m/s^2]
+WALL_RANGE = 0.1  # distances to walls are clipped to this [m]
 
 
 class TransformerBlock(nn.Module):
@@ -29,7 +29,7 @@ class TransformerBlock(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, x: Float[Tensor, "s p w"], keys: Bool[Tensor, "s p"]) -> Float[Tensor, "s p w"]:
-        """Tokens of s sequences after attention and feed-forward; only tokens in `keys` are attended to."""
+        """Return the tokens of s sequences after attention and feed-forward; only tokens in `keys` are attended to."""
         q, k, v = self.qkv(self.before(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         y = scaled_dot_product_attention(q, k, v, attn_mask=keys[:, None, None])
         x = x + self.out(y.transpose(1, 2).flatten(2))
@@ -37,7 +37,7 @@ class TransformerBlock(nn.Module):
 
 
 def features(initial: InitialConditions, state: PointState) -> Float[Tensor, "b o n 29"]:
-    """Input features of a keypoint, scaled to order one."""
+    """Input features of each keypoint, scaled to order one."""
     x, v = state.position, state.velocity
     com, drift = centre_of_mass(initial, x), centre_of_mass(initial, v)
     present = initial.present[..., None]
@@ -70,9 +70,9 @@ class Transformer(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
-        """Velocity [m/s], and acceleration by network, gravity and forces [m/s^2]; 0 for points that may not move."""
+        """Return velocity [m/s], and acceleration by network, gravity and forces [m/s^2]; 0 for immovable points."""
         b, o, n = initial.valid.shape
-        # padded objects attend to their own padding, as a softmax over nothing is nan
+        # padded objects attend to their own padding, because a softmax over no keys is nan
         own = (initial.valid | ~initial.present[..., None]).flatten(0, 1)
         x = self.embed(features(initial, state))
         for i, block in enumerate(self.blocks):

@@ -22,7 +22,7 @@ def download() -> Files:
 
 
 def _matching(files: list, patterns: tuple[str, ...]) -> list:
-    """Files that match the patterns; ValueError if a pattern matches none."""
+    """Return the files that match the patterns; ValueError if a pattern matches no file."""
     for pattern in patterns:
         if not any(fnmatch(f.rfilename, pattern) for f in files):
             raise ValueError(f"it holds no {pattern}")

@@ -1,4 +1,4 @@
-"""DiffSplat's sampler on top of diffusers: denoises four latent maps of one object jointly."""
+"""DiffSplat's sampler on top of diffusers, which jointly denoises four latent maps of one object."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from transformers import CLIPTextModel, CLIPTokenizer
 
 VIEWS = len(AZIMUTHS)
-STEPS = 20  # of the sampler
-GUIDANCE = (1.0, 2.0)  # classifier-free guidance of the view of the image, and of the opposite one
+STEPS = 20  # number of steps of the sampler
+GUIDANCE = (1.0, 2.0)  # classifier-free guidance of the view of the image, and of the opposite view
 NEGATIVE = "worst quality, normal quality, low quality, low res, blurry, ugly, disgusting"
 
 
 class MultiViewAttention:
-    """Self-attention over the tokens of all `views` of an object: (b v) n d as b (v n) d."""
+    """Self-attention over the tokens of all `views` of an object: (b v) n d is treated as b (v n) d."""
 
     def __init__(self, views: int):
         from diffusers.models.attention_processor import AttnProcessor2_0
@@ -48,7 +48,7 @@ def share_attention(unet: UNet2DConditionModel, views: int = VIEWS + 1) -> None:
 
 
 def triangle(low: float, high: float, views: int = VIEWS) -> Float[Tensor, "v"]:
-    """Guidance of each view: `low` for the first, linear to `high` for the opposite one, and back.
+    """Guidance of each view: `low` for the first, linear to `high` for the opposite view, and back.
 
     Source: Voleti et al. 2024, "SV3D", section 3, "triangular CFG scaling".
     """
@@ -62,9 +62,9 @@ class DiffSplat:
 
     tokenizer: CLIPTokenizer
     text_encoder: CLIPTextModel
-    vae: AutoencoderKL  # of images
+    vae: AutoencoderKL  # autoencoder of images
     unet: UNet2DConditionModel  # 4 latent + 6 ray + 1 flag channels in, 4 out
-    gsvae: AutoencoderKL  # of maps of Gaussians
+    gsvae: AutoencoderKL  # autoencoder of maps of Gaussians
     scheduler: DPMSolverMultistepScheduler
 
     @property
@@ -73,10 +73,10 @@ class DiffSplat:
         return self.unet.config.sample_size * 2 ** (len(self.vae.config.block_out_channels) - 1)
 
     def generate(self, image: Float[Tensor, "s s 3"], elevation: float, prompt: str = "", seed: int = 0) -> Gaussians:
-        """Gaussians of the whole object of an image, on the CPU, in DiffSplat's frame; camera 0 is that of the image.
+        """Generate Gaussians of the whole object in an image, on the CPU, in DiffSplat's frame.
 
-        `image`: the object alone on white, centred, its longer side 4/5 of the image. `elevation`: of the camera above
-        the horizon [degrees]; the training range is -5 to 30.
+        `image` shows only the object on white, centred, its longer side 4/5 of the image. Its camera is camera 0, at
+        `elevation` above the horizon [degrees]; the training range is -5 to 30.
         """
         viewmats = cameras(elevation)
         return to_gaussians(self.sample(image, viewmats, prompt, seed).cpu(), viewmats)
@@ -85,10 +85,10 @@ class DiffSplat:
     def sample(
         self, image: Float[Tensor, "s s 3"], viewmats: Float[Tensor, "v 4 4"], prompt: str = "", seed: int = 0
     ) -> Float[Tensor, "v 12 s s"]:
-        """Maps of Gaussians of the four views, in -1..1.
+        """Sample the maps of Gaussians of the four views, in -1..1.
 
-        Classifier-free guidance: conditioned on the image latent and `prompt`, unconditioned on zeros and NEGATIVE.
-        Noise is drawn on the CPU, so that a seed gives the same noise on every device.
+        Uses classifier-free guidance: the conditional branch gets the image latent and `prompt`, the unconditional one
+        zeros and NEGATIVE. Noise is drawn on the CPU, so that a seed gives the same noise on every device.
         """
         device = self.unet.device
         text = encode_prompts(self.tokenizer, self.text_encoder, [NEGATIVE, prompt]).repeat_interleave(VIEWS + 1, 0)
@@ -110,7 +110,7 @@ class DiffSplat:
         return torch.cat([self.gsvae.decode(z).sample for z in latents.split(1)]).clamp(-1, 1)
 
     def _ray_channels(self, viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "w 7 z z"]:
-        """Rays of the image and the views at latent resolution, flag 0 for the image and 1 for generated views."""
+        """Rays of the image and the views at latent resolution, and a flag: 0 for the image, 1 for generated views."""
         rays = plucker(viewmats.cpu(), self.side).to(viewmats)
         rays = torch.nn.functional.interpolate(rays, (side, side), mode="bilinear")
         flags = torch.ones(VIEWS + 1, 1, side, side).to(rays)
@@ -118,6 +118,6 @@ class DiffSplat:
         return torch.cat([torch.cat([rays[:1], rays]), flags], 1)
 
     def _image_latent(self, image: Float[Tensor, "s s 3"]) -> Float[Tensor, "1 4 z z"]:
-        """Latent of the image: the encoder's mean, scaled."""
+        """Latent of the image: the mean of the encoder, scaled."""
         latent = self.vae.encode(2 * image.permute(2, 0, 1)[None] - 1).latent_dist.mode()
         return latent * self.vae.config.scaling_factor

@@ -6,9 +6,9 @@ A folder holds three parts under their published names:
     gsvae_gobj265k_sd/checkpoints/NUMBER/model.safetensors
     stable-diffusion-v1-5/                                           tokenizer/ text_encoder/ vae/ scheduler/
 
-The U-Net's tensors have the names of Stable Diffusion's; its 859,541,124 32-bit numbers make the 3.44 GB that the
-hub lists. The names in the second file follow from the public code (`vae.` before those of an autoencoder with 12
-channels in and out, and a `tiny_decoder.` for training alone); the file itself was not available for testing.
+The U-Net's tensors have the names of those in Stable Diffusion; its 859,541,124 32-bit numbers are the 3.44 GB that the
+hub lists. The names in the second file follow from the public code (an autoencoder with 12 channels in and out,
+prefixed with `vae.`, and a `tiny_decoder.` used only in training); the file itself was not available for testing.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from stages.core.models.diffsplat.network import DiffSplat
 
 UNET, GSVAE, BASE = "gsdiff_gobj83k_sd15_image__render", "gsvae_gobj265k_sd", "stable-diffusion-v1-5"
-PARTS = ("tokenizer", "text_encoder", "vae", "scheduler")  # of Stable Diffusion
-IN_CHANNELS = 4 + 6 + 1  # of the U-Net: latent, ray, flag
+PARTS = ("tokenizer", "text_encoder", "vae", "scheduler")  # parts of Stable Diffusion that are used
+IN_CHANNELS = 4 + 6 + 1  # input channels of the U-Net: latent, ray, flag
 
 
 @dataclass(frozen=True)
 class DiffSplatSource(HubSource):
-    """A publication of weights, and the files of it that are needed."""
+    """A publication of weights, and which of its files are needed."""
 
     wanted: tuple[str, ...]  # glob patterns of files
     into: str  # subfolder of the weights folder
@@ -65,7 +65,7 @@ class Files:
 
 
 def find(given: Path | None = None) -> Files:
-    """The parts in a folder, by default diffsplat/ of $NGFF_WEIGHTS or of the user's cache.
+    """Find the parts in a folder, by default diffsplat/ of $NGFF_WEIGHTS or of the user's cache.
 
     Raises InputError if parts are missing.
     """
@@ -90,7 +90,7 @@ def _files(folder: Path) -> Files:
 
 
 def _last(model: Path) -> Path:
-    """Folder of the checkpoint with the most steps; their names are numbers."""
+    """Folder of the checkpoint with the most steps; folder names are numbers of steps."""
     numbers = [p for p in (model / "checkpoints").glob("*") if p.name.isdigit()]
     return max(numbers, key=lambda p: int(p.name)) if numbers else model / "checkpoints/NUMBER"
 
@@ -101,7 +101,7 @@ def _missing(files: Files) -> list[Path]:
 
 
 def load(files: Files, device: str = "cpu") -> DiffSplat:
-    """The model in 32 bit, for inference; sizes come from the configurations next to the weights.
+    """Load the model in 32 bit, for inference; sizes come from the configurations next to the weights.
 
     Raises InputError for missing packages and for files that are damaged or of another model.
     """
@@ -118,10 +118,10 @@ def load(files: Files, device: str = "cpu") -> DiffSplat:
 
 
 def sampler(config: dict):
-    """SDE-DPM-Solver++ for v-prediction with Stable Diffusion's noise schedule.
+    """Build SDE-DPM-Solver++ for v-prediction with Stable Diffusion's noise schedule.
 
-    The public code also requests betas rescaled to zero terminal SNR, but changes the configuration only after it was
-    read, in training and in inference, so the rescaling never took effect and is omitted here.
+    The public code also requests betas rescaled to zero terminal SNR, but changes the configuration only after it has
+    been read, in training and in inference, so the rescaling never takes effect and is omitted here.
     """
     from diffusers import DPMSolverMultistepScheduler
 
@@ -131,7 +131,7 @@ def sampler(config: dict):
 
 
 def gaussian_vae(config: dict) -> nn.Module:
-    """Stable Diffusion's autoencoder with CHANNELS in and out, for maps of Gaussians, on the meta device."""
+    """Build Stable Diffusion's autoencoder with CHANNELS in and out, for maps of Gaussians, on the meta device."""
     from diffusers import AutoencoderKL
 
     with torch.device("meta"):
@@ -139,7 +139,7 @@ def gaussian_vae(config: dict) -> nn.Module:
 
 
 def _unet(config: Path) -> nn.Module:
-    """The U-Net of a published configuration, on the meta device. Raises InputError for another configuration.
+    """Build the U-Net of a published configuration, on the meta device. Raises InputError for other configurations.
 
     Its blocks, CrossAttnDownBlockMV2D and so on, are those of diffusers except for the attention.
     """
@@ -159,7 +159,7 @@ def _unet(config: Path) -> nn.Module:
 
 
 def filled(model: nn.Module, path: Path, prefix: str = "", but: tuple[str, ...] = ()) -> nn.Module:
-    """The model with the tensors of a file in 32 bit: `prefix` removed, names starting with `but` skipped.
+    """Fill a model with the tensors of a file in 32 bit; removes `prefix`, skips names that start with `but`.
 
     Raises InputError if the tensors do not fit.
     """

@@ -1,8 +1,8 @@
 """ALIKED: keypoints and descriptors of an image by a small network with deformable convolutions.
 
 Source: Zhao et al. 2023, "ALIKED: A lighter keypoint and descriptor extraction network via deformable
-transformation", aliked-n16 and -n16rot. Modules carry the published names, so that the published weights load.
-Deformable convolution is written with grid_sample, which every PyTorch has.
+transformation", aliked-n16 and -n16rot. Modules have the published names, so that the published weights load.
+Deformable convolution is implemented with grid_sample, which is part of PyTorch.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-WIDTHS = (16, 32, 64, 128)  # of the four blocks, at 1, 1/2, 1/8 and 1/32 of the resolution
-DIM, SAMPLES = 128, 16  # length of a descriptor, and sampling positions that it is gathered from
-RADIUS = 2  # of non-maximum suppression and of the refinement below a pixel [px]
-TEMPERATURE = 0.1  # of the soft maximum of that refinement
-MULTIPLE = 32  # image sides are padded to a multiple of it [px]
+WIDTHS = (16, 32, 64, 128)  # channels of the four blocks, at 1, 1/2, 1/8 and 1/32 of the resolution
+DIM, SAMPLES = 128, 16  # length of a descriptor, and number of sampling positions that it is gathered from
+RADIUS = 2  # radius of non-maximum suppression and of subpixel refinement [px]
+TEMPERATURE = 0.1  # temperature of the soft argmax in subpixel refinement
+MULTIPLE = 32  # image sides are padded to a multiple of this [px]
 
 
 class DeformableConv(nn.Module):
@@ -28,7 +28,7 @@ class DeformableConv(nn.Module):
         self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
 
     def forward(self, x: Float[Tensor, "1 i h w"]) -> Float[Tensor, "1 o h w"]:
-        """Convolution of `x` with offsets of at most a quarter of the longer side [px]."""
+        """Return the convolution of `x`, with offsets of at most a quarter of the longer side [px]."""
         h, w = x.shape[2:]
         limit = max(h, w) / 4
         offsets = self.offset_conv(x).clamp(-limit, limit).reshape(9, 2, h, w)  # dy, dx of each tap
@@ -56,7 +56,7 @@ class ConvBlock(nn.Module):
         self.downsample = nn.Conv2d(inputs, outputs, 1) if shortcut else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """Feature maps (1, i, h, w) -> (1, o, h, w)."""
+        """Map features (1, i, h, w) to (1, o, h, w)."""
         out = self.bn2(self.conv2(F.selu(self.bn1(self.conv1(x)))))
         return F.selu(out if self.downsample is None else out + self.downsample(x))
 
@@ -73,7 +73,7 @@ class Descriptor(nn.Module):
         self.agg_weights = nn.Parameter(torch.zeros(SAMPLES, DIM, DIM))
 
     def forward(self, x: Float[Tensor, "1 c h w"], keypoints: Float[Tensor, "k 2"]) -> Float[Tensor, "k c"]:
-        """Unit-length descriptors of keypoints (x, y) [px] in the feature maps `x`."""
+        """Return unit-length descriptors of keypoints (x, y) [px] in the feature maps `x`."""
         h, w = x.shape[2:]
         corner = (keypoints.long() - 1).clamp_min(0)
         corner = torch.minimum(corner, torch.tensor([w - 4, h - 4], device=x.device))
@@ -122,16 +122,16 @@ class ALIKED(nn.Module):
     def keypoints_of(
         self, image: Float[Tensor, "h w 3"], maximum: int, min_score: float = 0.2
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 128"]]:
-        """At most `maximum` keypoints [px] of an RGB image in 0..1, pixel centres at +0.5, and unit descriptors."""
+        """Find up to `maximum` keypoints [px] of an RGB image in 0..1, pixel centres at +0.5, and unit descriptors."""
         features, scores = self.maps(image.permute(2, 0, 1)[None])
         keypoints = peaks(scores, maximum, min_score)
         return keypoints + 0.5, self.desc_head(features, keypoints)
 
 
 def peaks(scores: Float[Tensor, "1 1 h w"], maximum: int, threshold: float) -> Float[Tensor, "k 2"]:
-    """Up to `maximum` highest local maxima (x, y) above `threshold` [px], pixel centres at integers.
+    """Find up to `maximum` highest local maxima (x, y) [px] of scores above `threshold`, pixel centres at integers.
 
-    Positions are refined to subpixels by a soft argmax.
+    Positions are refined to subpixel accuracy by a soft argmax.
     """
     suppressed = suppress_nonmaxima(scores)[0, 0]
     for edge in (suppressed[:RADIUS], suppressed[-RADIUS:], suppressed[:, :RADIUS], suppressed[:, -RADIUS:]):
@@ -147,9 +147,9 @@ def peaks(scores: Float[Tensor, "1 1 h w"], maximum: int, threshold: float) -> F
 
 
 def suppress_nonmaxima(scores: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 h w"]:
-    """Non-maximum suppression: scores of maxima within RADIUS, zero elsewhere.
+    """Non-maximum suppression: keep the scores of maxima within RADIUS, and set the others to zero.
 
-    Two more rounds keep maxima whose only higher neighbours were themselves suppressed.
+    Two further rounds restore maxima whose only higher neighbours were themselves suppressed.
     """
 
     def local_maximum(x: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
-"""LightGlue: matches between the keypoints of two images, by attention within and between the images.
+"""LightGlue: matches the keypoints of two images by attention within and between the images.
 
 Source: Lindenberger et al. 2023, "LightGlue: Local feature matching at light speed", for ALIKED's descriptors.
-Modules carry the published names, so that the published weights load. It stops at the layer where nearly all
-keypoints are confident; keypoints are not pruned.
+Modules have the published names, so that the published weights load. Inference stops early at the layer where nearly
+all keypoints are confident; keypoints are not pruned.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 INPUT, DIM, HEADS, LAYERS = 128, 256, 4, 9
-MIN_PROBABILITY = 0.1  # of a match
-CONFIDENT_FRACTION = 0.95  # of keypoints, to stop early
+MIN_PROBABILITY = 0.1  # smallest probability of a match
+CONFIDENT_FRACTION = 0.95  # fraction of confident keypoints above which inference stops early
 
 
 def _ffn() -> nn.Sequential:
@@ -39,7 +39,7 @@ class Position(nn.Module):
         self.Wr = nn.Linear(2, DIM // HEADS // 2, bias=False)
 
     def forward(self, keypoints: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
-        """Cosine and sine of the rotation angles, each (n, DIM / HEADS), at normalised keypoint positions."""
+        """Return cosine and sine of the rotation angles, each (n, DIM / HEADS), at normalised keypoint positions."""
         angle = self.Wr(keypoints).repeat_interleave(2, 1)
         return angle.cos(), angle.sin()
 
@@ -65,7 +65,7 @@ class SelfBlock(nn.Module):
 
 
 class CrossBlock(nn.Module):
-    """Attention to the keypoints of the other image; queries and keys are the same."""
+    """Attention to the keypoints of the other image; queries and keys share one projection."""
 
     def __init__(self):
         super().__init__()
@@ -88,12 +88,12 @@ class Layer(nn.Module):
         self.self_attn, self.cross_attn = SelfBlock(), CrossBlock()
 
     def forward(self, a: Tensor, b: Tensor, at_a: tuple, at_b: tuple) -> tuple[Tensor, Tensor]:
-        """Updated features of both images, `at_a` and `at_b` being their rotary embeddings."""
+        """Updated features of both images; `at_a` and `at_b` are their rotary embeddings."""
         return self.cross_attn(self.self_attn(a, at_a), self.self_attn(b, at_b))
 
 
 class Assignment(nn.Module):
-    """Log probability of a match: dual softmax of similarities times both matchabilities."""
+    """Log probability of matches: dual softmax of similarities times the matchabilities of both keypoints."""
 
     def __init__(self):
         super().__init__()
@@ -131,7 +131,10 @@ class LightGlue(nn.Module):
         descriptors: tuple[Float[Tensor, "n f"], Float[Tensor, "m f"]],
         sizes: tuple[tuple[int, int], tuple[int, int]],
     ) -> Int[Tensor, "k 2"]:
-        """Rows (index in the first, index in the second) of keypoints [px] of images of (width, height) `sizes`."""
+        """Match keypoints [px] of two images; returns rows (index in the first, index in the second image).
+
+        `sizes` are (width, height) of the images [px].
+        """
         if min(len(keypoints[0]), len(keypoints[1])) == 0:
             return torch.zeros(0, 2, dtype=torch.int64, device=keypoints[0].device)
         positions = [self.posenc(normalised(k, size)) for k, size in zip(keypoints, sizes, strict=True)]
@@ -148,12 +151,12 @@ class LightGlue(nn.Module):
 
 
 def normalised(keypoints: Float[Tensor, "n 2"], size: tuple[int, int]) -> Float[Tensor, "n 2"]:
-    """Positions relative to the image centre, the longer side from -1 to 1."""
+    """Positions relative to the image centre, scaled so that the longer side is from -1 to 1."""
     return (keypoints - torch.tensor(size).to(keypoints) / 2) / (max(size) / 2)
 
 
 def mutual(probability: Float[Tensor, "n m"]) -> Int[Tensor, "k 2"]:
-    """Mutual best matches with at least MIN_PROBABILITY, as pairs of indices."""
+    """Return mutual best matches with more than MIN_PROBABILITY, as pairs of indices."""
     value, to_b = probability.max(1)
     rows = torch.arange(len(value), device=value.device)
     keep = (probability.argmax(0)[to_b] == rows) & (value > MIN_PROBABILITY)

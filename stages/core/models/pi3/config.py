@@ -1,4 +1,4 @@
-"""Sizes of the network; the defaults are the published ones."""
+"""Sizes of the network; the defaults are as published."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from torch import Tensor
 class Pi3Config:
     """Sizes of the network."""
 
-    width: int = 1024  # features of a token
-    head: int = 64  # features of an attention head
+    width: int = 1024  # features per token
+    head: int = 64  # features per attention head
     encoder_depth: int = 24  # blocks of the per-view encoder
-    decoder_depth: int = 36  # blocks that attend within a view and over all views in turn
+    decoder_depth: int = 36  # blocks that attend alternately within a view and over all views
     head_depth: int = 5  # blocks of each output decoder
     camera_width: int = 512
     table: int = 37  # side of the learned table of position embeddings [patches]
     splat_widths: tuple[int, int, int] = (512, 512, 256)  # layer widths of the splat head on the patch grid
-    splat_features: int = 128  # of each of its two branches on the pixel grid
+    splat_features: int = 128  # features of each of the splat head's two branches on the pixel grid
 
     @classmethod
     def of(cls, shapes: Mapping[str, Tensor]) -> Pi3Config:
-        """Sizes inferred from a state dict (names as in π³). For another model's KeyError, IndexError or TypeError."""
+        """Infer the sizes from a state dict with the names of π³.
+
+        Raises KeyError, IndexError or TypeError for the state dict of another model.
+        """
 
         def depth(prefix: str) -> int:
             return sum(name.startswith(prefix) and name.endswith(".norm1.weight") for name in shapes)

@@ -38,7 +38,7 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(width, EPS)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b t c"]:
-        """Tokens of normalised images, sides multiples of 14: class, registers, then the patches in row order."""
+        """Tokens of normalised images with sides that are multiples of 14: class, registers, patches in row order."""
         maps = self.patch_embed.proj(images)
         patches = maps.flatten(2).mT + self._position_embeddings(*maps.shape[2:]).to(maps.dtype)
         first = self.cls_token + self.pos_embed[:, :1]

@@ -1,6 +1,6 @@
-"""The head that predicts a Gaussian's parameters for each pixel, from a token branch and a colour branch.
+"""The head that predicts the parameters of a Gaussian for each pixel, with a token branch and a colour branch.
 
-Names as in the published weights of Pi3-splat (the Gaussian splat variant of NGFF's reconstruction).
+Names are those of the published weights of Pi3-splat (the Gaussian splat variant of NGFF's reconstruction).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ColourBranch(nn.Module):
 
 
 class FeatureHead(nn.Module):
-    """Token and colour branches, joined by a linear layer per pixel."""
+    """Token and colour branches, joined by a pixelwise linear layer."""
 
     def __init__(self, width: int, widths: tuple[int, int, int], features: int, channels: int):
         super().__init__()
@@ -65,7 +65,7 @@ class FeatureHead(nn.Module):
         self.down_proj = nn.Linear(2 * features, channels)
 
     def forward(self, tokens: Float[Tensor, "b t c"], images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h w k"]:
-        """`channels` values per pixel, from the patch tokens in row order and the normalised images."""
+        """Return `channels` values per pixel, from the patch tokens in row order and the normalised images."""
         grid = images.shape[2] // PATCH, images.shape[3] // PATCH
         coarse = self.upsample_proj.model(tokens.mT.unflatten(2, grid))
         fine = self.conv_net.layers(images)

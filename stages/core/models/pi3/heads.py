@@ -38,13 +38,13 @@ class LinearMap(nn.Module):
         self.proj = nn.Linear(width, channels * PATCH * PATCH)
 
     def forward(self, tokens: Float[Tensor, "b t c"], rows: int, columns: int) -> Float[Tensor, "b h w k"]:
-        """A map of k values per pixel from the tokens of `rows` x `columns` patches, in row order."""
+        """Return a map of k values per pixel from the tokens of `rows` x `columns` patches, in row order."""
         maps = self.proj(tokens).mT.unflatten(2, (rows, columns))
         return F.pixel_shuffle(maps, PATCH).permute(0, 2, 3, 1)
 
 
 def local_points(raw: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Points in the frame of their camera from the network's (x / z, y / z, log z)."""
+    """Convert the network's output (x / z, y / z, log z) to points in the frame of their camera."""
     z = raw[..., 2:].exp()
     return torch.cat([raw[..., :2] * z, z], -1)
 
@@ -73,7 +73,7 @@ class CameraHead(nn.Module):
         self.fc_rot = nn.Linear(width, 9)
 
     def forward(self, tokens: Float[Tensor, "b t c"]) -> Float[Tensor, "b 4 4"]:
-        """Camera-to-world matrices (x right, y down, z forward), up to a common similarity."""
+        """Camera-to-world matrices (x right, y down, z forward), up to a common similarity transform."""
         for block in self.res_conv:
             tokens = block(tokens)
         pooled = self.more_mlps(tokens.mean(1))
@@ -85,7 +85,7 @@ class CameraHead(nn.Module):
 
 
 def orthogonal(nine: Float[Tensor, "b 9"]) -> Float[Tensor, "b 3 3"]:
-    """Rotations from nine numbers: the nearest rotation to the matrix of their normalised rows.
+    """Rotations from nine numbers: the rotation nearest to the matrix with rows normalised.
 
     Source: Levinson et al. 2020, "An analysis of SVD for deep rotation estimation", eq. 3.
     """

@@ -1,4 +1,4 @@
-"""The transformer block of all parts of the network."""
+"""The transformer block that all parts of the network use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from stages.core.models.pi3.rope import RotaryEmbedding, rotate
 
-EPS = 1e-6  # of the layer norms outside attention
+EPS = 1e-6  # epsilon of the layer norms outside attention
 
 
 class Attention(nn.Module):
@@ -22,15 +22,15 @@ class Attention(nn.Module):
         self.proj = nn.Linear(width, width)
         self.q_norm = nn.LayerNorm(head) if normalised else nn.Identity()
         self.k_norm = nn.LayerNorm(head) if normalised else nn.Identity()
-        self.attend = F.scaled_dot_product_attention  # never stores the t x t matrix; a benchmark replaces it
+        self.attend = F.scaled_dot_product_attention  # does not store the t x t matrix; replaced in a benchmark
 
     def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding | None = None) -> Float[Tensor, "b t c"]:
-        """Attention among the t tokens of each sequence; `positions`: their rotary embeddings, if any."""
+        """Attention among the t tokens of each sequence; `positions` are their rotary embeddings, if any."""
         q, k, v = self.qkv(x).unflatten(-1, (3, -1, self.head)).permute(2, 0, 3, 1, 4)  # each (b, heads, t, d)
         q, k = self.q_norm(q), self.k_norm(k)
         if positions is not None:
             q, k = rotate(q, positions), rotate(k, positions)
-        out = self.attend(q.to(v.dtype), k.to(v.dtype), v)  # norms and rotations stay in 32 bit under autocast
+        out = self.attend(q.to(v.dtype), k.to(v.dtype), v)  # under autocast, norms and rotations are in 32 bit
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
@@ -43,7 +43,7 @@ class MLP(nn.Module):
         self.fc2 = nn.Linear(hidden, width)
 
     def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
-        """Tokens -> tokens of the same width, each on its own."""
+        """Transform each token separately; the width stays the same."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 

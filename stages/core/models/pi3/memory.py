@@ -13,23 +13,23 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.network import CAMERA_REGISTERS
 from stages.core.models.pi3.splat import CHANNELS
 
-MEMORY_FRACTION = 0.9  # of the free memory that may be used
+MEMORY_FRACTION = 0.9  # fraction of the free memory that may be used
 AT_ONCE = (8, 4, 2, 1)  # candidate numbers of views processed together in the per-view parts
 
 
 def weights(model: nn.Module) -> int:
-    """Bytes of the parameters and buffers."""
+    """Return the bytes of the parameters and buffers."""
     return sum(x.numel() * x.element_size() for x in model.state_dict().values())
 
 
 def activations(
     config: Pi3Config, views: int, size: tuple[int, int], at_once: int, splats: bool, half: bool = False
 ) -> int:
-    """Peak bytes of activations for images of `size` (height, width); linear in the number of tokens.
+    """Estimate the peak bytes of activations for images of `size` (height, width); linear in the number of tokens.
 
     Per token a block holds the residual stream, its norm, queries, keys, values and the temporaries of the rotary
-    embedding (32 bit even if `half` computes the rest in 16). Afterwards the results of all views are kept, twice while
-    they are concatenated.
+    embedding (32 bit, even if `half` computes the rest in 16). Afterwards the results of all views are stored, twice
+    while they are concatenated.
     """
     number, pixels = (2 if half else 4), size[0] * size[1]
     tokens = pixels // PATCH**2 + CAMERA_REGISTERS
@@ -40,7 +40,7 @@ def activations(
 
 
 def free(device: str) -> int | None:
-    """Free bytes on a device; None if the system does not report them."""
+    """Return the free bytes on a device; None if the system does not report them."""
     if device != "cpu":
         unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + unused
@@ -56,9 +56,9 @@ def free(device: str) -> int | None:
 
 
 def plan(config: Pi3Config, views: int, size: tuple[int, int], splats: bool, half: bool, room: int | None) -> int:
-    """Largest number of views to process at once within `room` bytes (None: unlimited).
+    """Return the largest number of views to process at once within `room` bytes (None: unlimited).
 
-    Raises InputError, with the number of photos that would fit, if even one at a time is too much.
+    Raises InputError, with the number of photos that would fit, if even one view at a time needs too much.
     """
 
     def fits(views: int, at_once: int) -> bool:

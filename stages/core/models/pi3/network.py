@@ -1,4 +1,4 @@
-"""π³: an unordered set of photos to a point and a confidence per pixel and a camera per photo."""
+"""The π³ network: maps an unordered set of photos to a point and a confidence per pixel, and a camera per photo."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecod
 from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.rope import RotaryEmbedding, patch_positions, rotary_embedding
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # mean and standard deviation of the colours of ImageNet
 CAMERA_REGISTERS = 5  # register tokens of each view, before its patches
 
 
@@ -23,7 +23,7 @@ CAMERA_REGISTERS = 5  # register tokens of each view, before its patches
 class Geometry:
     """Network output for v views; all lengths are in the same unknown unit."""
 
-    points: Float[Tensor, "v h w 3"]  # of each pixel, in its camera's frame
+    points: Float[Tensor, "v h w 3"]  # point of each pixel, in its camera's frame
     confidence: Float[Tensor, "v h w"]  # 0..1
     poses: Float[Tensor, "v 4 4"]  # camera-to-world: x right, y down, z forward
 
@@ -54,24 +54,27 @@ class Pi3(nn.Module):
         return TransformerDecoder(2 * c.width, c.width, width_out, c.head, c.head_depth)
 
     def forward(self, images: Float[Tensor, "v 3 h w"], at_once: int = 8) -> Geometry:
-        """Geometry of RGB views in 0..1; per-view parts process `at_once` views at a time."""
+        """Return the geometry of RGB views in 0..1; per-view parts process `at_once` views at a time."""
         hidden, positions = self.tokens(images, at_once)
         return self.geometry(hidden, positions, images.shape[2:], at_once)
 
     def tokens(self, images: Float[Tensor, "v 3 h w"], at_once: int) -> tuple[Float[Tensor, "v t c"], RotaryEmbedding]:
-        """Multi-view tokens, registers before patches, and their rotary embedding."""
+        """Return multi-view tokens, registers before patches, and their rotary embedding."""
         views, _, height, width = images.shape
         positions = patch_positions(views, height // PATCH, width // PATCH, CAMERA_REGISTERS, images.device)
         positions = rotary_embedding(positions, self.config.head)
         return alternate(self.decoder, by_views(self._encode_views, at_once, images), positions, at_once), positions
 
     def _encode_views(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v t c"]:
-        """Tokens of each view alone: registers, then patches."""
+        """Tokens of each view, encoded separately: registers, then patches."""
         patches = self.encoder((images - self.image_mean) / self.image_std)[:, 1 + REGISTERS :]
         return torch.cat([self.register_token[0].expand(len(images), -1, -1).to(patches.dtype), patches], 1)
 
     def geometry(self, hidden: Float[Tensor, "v t c"], positions: RotaryEmbedding, size, at_once: int) -> Geometry:
-        """Outputs of the three heads. Their last layers stay in 32 bit, as depth is an exponential of the output."""
+        """Return the outputs of the three heads.
+
+        Their last layers are in 32 bit, since depth is an exponential of the output.
+        """
         grid = size[0] // PATCH, size[1] // PATCH
 
         def one_part(hidden: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,9 +89,9 @@ class Pi3(nn.Module):
 
 
 def halve(model: nn.Module) -> nn.Module:
-    """Convert linear layers and convolutions to bfloat16, except the last of the heads, in place.
+    """Convert linear layers and convolutions to bfloat16 in place, except the last layers of the heads.
 
-    For inference under autocast to bfloat16, where it changes no result, only the memory and time of casting.
+    For inference under autocast to bfloat16, where it does not change results, but saves the memory and time of casts.
     """
     for name, module in model.named_modules():
         last = {"point_head", "conf_head", "camera_head"} & set(name.split("."))
@@ -98,7 +101,10 @@ def halve(model: nn.Module) -> nn.Module:
 
 
 def alternate(blocks: nn.ModuleList, x: Float[Tensor, "v t c"], positions: RotaryEmbedding, at_once: int) -> Tensor:
-    """Even blocks attend within a view, odd ones over all views; the last two outputs concatenated, (v, t, 2 c)."""
+    """Apply blocks that attend within a view (even) and over all views (odd); concatenates the last two outputs.
+
+    The result is (v, t, 2 c).
+    """
     joint = RotaryEmbedding(*(part.transpose(0, 1).flatten(1, 2)[None] for part in positions))
     last = []
     for i, block in enumerate(blocks):
@@ -111,7 +117,7 @@ def alternate(blocks: nn.ModuleList, x: Float[Tensor, "v t c"], positions: Rotar
 
 
 def by_views(function: Callable, at_once: int, *inputs: Tensor):
-    """function(*inputs) for `at_once` views at a time, which bounds memory; views must not depend on each other."""
+    """Apply a function to `at_once` views at a time, to bound memory; views must not depend on each other."""
     if len(inputs[0]) <= at_once:
         return function(*inputs)
     parts = [function(*part) for part in zip(*(x.split(at_once) for x in inputs), strict=True)]

@@ -1,7 +1,7 @@
 """Rotary position embedding in two dimensions.
 
 Source: Su et al. 2021, "RoFormer"; Heo et al. 2024, "Rotary Position Embedding for Vision Transformer", in the axial
-form: half of the features is rotated by the row, the other half by the column.
+form: half of the features are rotated according to the row, the other half according to the column.
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-BASE = 100.0  # wavelengths run from 2 pi to nearly 2 pi BASE patches
+BASE = 100.0  # wavelengths range from 2 pi to nearly 2 pi BASE patches
 
 
 class RotaryEmbedding(NamedTuple):
@@ -20,12 +20,12 @@ class RotaryEmbedding(NamedTuple):
     sin: Tensor
 
     def __getitem__(self, index) -> "RotaryEmbedding":
-        """Those of some sequences of the batch."""
+        """Select sequences of the batch."""
         return RotaryEmbedding(self.cos[index], self.sin[index])
 
 
 def rotary_embedding(positions: Int[Tensor, "b t 2"], dim: int) -> RotaryEmbedding:
-    """Angles for tokens at (row, column) and `dim` features a head, a multiple of 4."""
+    """Rotary embedding for tokens at (row, column), with `dim` features per head, a multiple of 4."""
     half = dim // 2
     frequency = BASE ** (-torch.arange(0, half, 2, device=positions.device) / half)
     angle = positions[..., None] * frequency  # (b, t, 2, dim / 4)
@@ -34,7 +34,7 @@ def rotary_embedding(positions: Int[Tensor, "b t 2"], dim: int) -> RotaryEmbeddi
 
 
 def rotate(x: Float[Tensor, "b heads t d"], by: RotaryEmbedding) -> Float[Tensor, "b heads t d"]:
-    """Rotated features; within each half, entry i pairs with entry i + d / 4."""
+    """Rotate features; within each half, entry i is paired with entry i + d / 4."""
     a, b = x.unflatten(-1, (2, 2, -1)).unbind(-2)
     across = torch.stack([-b, a], -2).flatten(-3)
     return x * by.cos + across * by.sin

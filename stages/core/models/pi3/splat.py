@@ -15,14 +15,14 @@ from stages.core.models.pi3.network import CAMERA_REGISTERS, Geometry, Pi3, by_v
 from stages.core.models.pi3.rope import RotaryEmbedding
 from stages.core.scene.gaussians import Gaussians
 
-DEGREE = 2  # of the spherical harmonics
+DEGREE = 2  # degree of the spherical harmonics
 CHANNELS = 1 + 3 + 4 + 3 * (DEGREE + 1) ** 2  # opacity, scales, quaternion x y z w, harmonics by colour
-SCALE_FACTOR, MAX_SCALE = 0.001, 0.3  # Gaussian scale: factor on the softplus, and maximum [units of the points]
+SCALE_FACTOR, MAX_SCALE = 0.001, 0.3  # scales of Gaussians: factor of the softplus, and maximum [units of the points]
 BANDS = (1.0, 0.025, 0.00625)  # factor on the harmonics of each degree, as published
 
 
 class SplatEncoder(Pi3):
-    """π³ and the head for Gaussians on the same tokens."""
+    """π³ with a head for Gaussians on the same tokens."""
 
     def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
         super().__init__(config)
@@ -43,16 +43,16 @@ class SplatEncoder(Pi3):
 
 
 class Pi3Splat(nn.Module):
-    """The published network: parameter names start with `encoder.`."""
+    """The published network, whose parameter names start with `encoder.`."""
 
     def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
         super().__init__()
         self.encoder = SplatEncoder(config)
 
     def forward(self, images: Float[Tensor, "v 3 h w"], at_once: int = 2) -> tuple[Geometry, Float[Tensor, "v h w k"]]:
-        """Geometry, and the raw parameters that `splat` converts to Gaussians.
+        """Return the geometry, and the raw parameters that `splat` converts to Gaussians.
 
-        The convolutions at pixel resolution dominate memory, so the default `at_once` is small.
+        The convolutions at pixel resolution dominate memory use, so the default `at_once` is small.
         """
         hidden, positions = self.encoder.tokens(images, at_once)
         geometry = self.encoder.geometry(hidden, positions, images.shape[2:], at_once)
@@ -60,7 +60,7 @@ class Pi3Splat(nn.Module):
 
 
 def splat(geometry: Geometry, raw: Float[Tensor, "v h w k"]) -> Gaussians:
-    """One Gaussian per pixel, in order of views and rows, in world coordinates.
+    """Return one Gaussian per pixel, in order of views and rows, in world coordinates.
 
     Harmonics are in world axes, as in the published renderer. Differentiable in `raw`.
     """
@@ -76,12 +76,12 @@ def splat(geometry: Geometry, raw: Float[Tensor, "v h w k"]) -> Gaussians:
 
 
 def band_factors(device=None) -> Float[Tensor, "k"]:
-    """Published factor of each of the k harmonics, by its degree."""
+    """Published factors of the k harmonics, which depend on their degrees."""
     return torch.cat([torch.full((2 * l + 1,), factor, device=device) for l, factor in enumerate(BANDS)])
 
 
 def decompose(covariances: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """Scales, largest first, and quaternions w x y z of covariances; variances are clamped to at least 1e-8."""
+    """Decompose covariances into scales, largest first, and quaternions w x y z; variances are at least 1e-8."""
     variances, axes = eigh(covariances)
     variances, axes = variances.flip(-1), axes.flip(-1)
     axes = torch.cat([axes[..., :2], axes[..., 2:] * torch.det(axes)[..., None, None]], -1)

@@ -1,4 +1,4 @@
-"""The published weights of π³ and Pi3-splat: locate, check and load."""
+"""Locate, check and load the published weights of π³ and Pi3-splat."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stages.core.models.torch_files import dense_tensors, read_checkpoint
 from stages.core.scene.files import must_exist
 from stages.core.scene.schema import reason
 
-MAX_DEPTH = 1000  # blocks of a part of the network; each takes time to make
+MAX_DEPTH = 1000  # largest number of blocks in a part of the network; building each takes time
 SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
 
@@ -29,7 +29,7 @@ class Pi3Source(HubSource):
     """A network and the publication of its weights."""
 
     network: type[nn.Module]
-    prefix: str  # of parameter names, before those of π³
+    prefix: str  # prefix of the parameter names of π³
 
 
 PUBLISHED = {
@@ -39,10 +39,10 @@ PUBLISHED = {
 
 
 def find(name: str, given: Path | None = None) -> Path:
-    """The file with the weights of `name`: the one given, or NAME.safetensors, NAME.pth or a file in the folder NAME/.
+    """Find the file with the weights of `name`: NAME.safetensors, NAME.pth, or a file in the folder NAME/.
 
-    `given` may be a file or a folder; without it $NGFF_WEIGHTS and the user's cache are searched. Raises InputError if
-    there is none.
+    `given` may be the file itself, or a folder to search; without it $NGFF_WEIGHTS and the user's cache are searched.
+    Raises InputError if there is none.
     """
     if given is not None and not Path(given).is_dir():
         must_exist(given, f"weights of {name} (.safetensors or .pth)")
@@ -62,7 +62,7 @@ def find(name: str, given: Path | None = None) -> Path:
 
 
 def load(path: Path, name: str) -> nn.Module:
-    """The network with the weights of a file, on the CPU, in 32 bit, for inference; sizes are inferred.
+    """Load the network with the weights of a file, on the CPU, in 32 bit, for inference; sizes are inferred.
 
     Raises InputError for a file that is damaged, holds something else, or lacks tensors.
     """
@@ -87,7 +87,7 @@ def load(path: Path, name: str) -> nn.Module:
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
-    """The tensors of a .safetensors file or of a PyTorch checkpoint, which may hold them one level down."""
+    """Read the tensors of a .safetensors file or of a PyTorch checkpoint, where they may be nested in a dictionary."""
     path = Path(path)
     must_exist(path, "weights (.safetensors or .pth)")
     try:
@@ -103,7 +103,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
 
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> str:
-    """Message listing missing and unknown tensors, and those of another shape or type; empty if all fit."""
+    """Return a message that lists missing and unknown tensors, and those of another shape or type; empty if all fit."""
     other = [f"{k} {tuple(given[k].shape)} instead of {tuple(wanted[k].shape)}"
              for k in wanted if k in given and given[k].shape != wanted[k].shape]  # fmt: skip
     unreal = [k for k in wanted if k in given and wanted[k].is_floating_point() > given[k].is_floating_point()]

@@ -20,11 +20,11 @@ from stages.core.models.sam2.network import input_side
 class MaskGenerationOptions:
     """Density of the point grid and the quality thresholds of masks."""
 
-    grid: int = 16  # points along each side; published is 32, but here several photos of one scene are searched
+    grid: int = 16  # points along each side; 32 as published, but here several photos of one scene are searched
     batch: int = 16  # points decoded together, about 30 MB each
-    min_iou: float = 0.8  # intersection over union that the network predicts for the mask
-    min_stability: float = 0.95  # intersection over union of the mask at a higher and at a lower threshold
-    max_iou: float = 0.7  # masks that overlap more than this are duplicates
+    min_iou: float = 0.8  # smallest IoU that the network predicts for a mask
+    min_stability: float = 0.95  # smallest IoU of a mask thresholded at a higher and at a lower value
+    max_iou: float = 0.7  # masks with a larger IoU are duplicates
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class MaskProposals:
 def propose_masks(
     model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: MaskGenerationOptions = MaskGenerationOptions()
 ) -> MaskProposals:
-    """Masks of a photo, at a quarter of the network's input size; each point gives up to three, of different extent.
+    """Return masks of a photo, at a quarter of the network's input size; up to three of different extent per point.
 
     Peak memory is that of `batch` points, plus 1 byte per pixel of each mask that is kept.
     """
@@ -76,9 +76,9 @@ def mask_stability(logits: Float[Tensor, "m h w"], offset: float = 1.0) -> Float
 
 
 def suppress_duplicates(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"], max_iou: float) -> Int[Tensor, "k"]:
-    """Non-maximum suppression: indices, best score first, of masks whose IoU with each better one is at most `max_iou`.
+    """Non-maximum suppression: indices, best score first, of masks whose IoU with each better mask is <= `max_iou`.
 
-    Masks are compared, not their bounding boxes, so that a ring and an object inside it both remain. Empty masks are
+    Masks are compared instead of bounding boxes, so that a ring and an object inside it are both kept. Empty masks are
     dropped.
     """
     flat = masks.flatten(1)

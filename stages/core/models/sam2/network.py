@@ -1,4 +1,4 @@
-"""Running SAM 2.1: photos to pixel values, and prompts in one photo to masks in all photos of a sequence."""
+"""Inference with SAM 2.1: preprocessing of photos, and propagation of prompts in one photo to masks in all photos."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from transformers import Sam2VideoInferenceSession, Sam2VideoModel
 
 from stages.core.models.promptable import FrameReader, MaskLogits, PointPrompts, Prompts
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as published in preprocessor_config.json
+# mean and standard deviation of the colours of ImageNet, as published in preprocessor_config.json
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def input_side(model: Sam2VideoModel) -> int:
@@ -44,9 +45,9 @@ class StreamingSession(Sam2VideoInferenceSession):
     def release(self, now: int, start: int, memories: int, pointers: int) -> None:
         """Delete the outputs that no later frame attends to.
 
-        The network attends to the prompted frame `start`, to the memory features of the last `memories` frames and
-        to the object pointers of the last `pointers` frames, counted from the current frame `now`, and on the
-        backward pass from `start`.
+        The network attends to the prompted frame `start`, to the memory features of the last `memories` frames and to
+        the object pointers of the last `pointers` frames, counted from the current frame `now` or, in the backward
+        pass, from `start`.
         """
         for outputs in self.output_dict_per_obj.values():
             for kept in (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values()):
@@ -65,7 +66,7 @@ class StreamingSession(Sam2VideoInferenceSession):
 def propagate_masks(
     model: Sam2VideoModel, frame: FrameReader, count: int, prompts: Prompts, start: int = 0
 ) -> MaskLogits:
-    """Mask logits of the objects, positive inside, for each photo, at a quarter of the network's input size.
+    """Yield mask logits of the objects, positive inside, for each photo, at a quarter of the network's input size.
 
     `prompts` mark the objects in photo `start`, by points or by masks; memory attention propagates them forwards to
     the last photo, then backwards to the first. `frame` returns the pixel values of a photo and is called once for
@@ -89,6 +90,6 @@ def propagate_masks(
 
 
 def _enlarged(mask: Bool[Tensor, "h w"], side: int) -> Float[Tensor, "1 1 s s"]:
-    """A mask resized to the network's input size."""
+    """Resize a mask to the network's input size."""
     size = {"size": (side, side), "mode": "bilinear", "align_corners": False, "antialias": True}
     return (torch.nn.functional.interpolate(mask[None, None].float(), **size) >= 0.5).float()

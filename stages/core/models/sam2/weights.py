@@ -1,4 +1,4 @@
-"""Published weights of SAM 2.1: find, download on request, load. Transformers is imported only to load them."""
+"""Find, download on request and load the published weights of SAM 2.1; transformers is imported only for loading."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ FILES = ("config.json", "model.safetensors")
 
 
 def find(given: Path | None = None) -> Path:
-    """Path of the weights: the file `given`, or model.safetensors in the folder `given`, with config.json next to it.
+    """Find the weights: the file `given`, or model.safetensors in the folder `given`, with config.json next to it.
 
-    Without `given`, the folder sam2/ is searched in $NGFF_WEIGHTS and in the user's cache. Raises InputError, naming
-    the download, where the files are missing.
+    Without `given`, the folder sam2/ is searched in $NGFF_WEIGHTS and in the user's cache. Raises InputError, which
+    names the download, if files are missing.
     """
     if given is not None and not Path(given).is_dir():
         must_exist(given, "the weights of SAM 2.1 (model.safetensors)")
@@ -43,7 +43,7 @@ def find(given: Path | None = None) -> Path:
 
 
 def load_segmenter(given: Path | None, download_missing: bool, device: str) -> PromptableSegmenter:
-    """The network with the weights that `find` finds, or, with `download_missing`, else downloads.
+    """Load the network with the weights that `find` finds; with `download_missing`, missing weights are downloaded.
 
     Memory: the weights, about 1 GB of activations, one photo, and 20 MB per object, for any number of photos.
     """
@@ -59,7 +59,10 @@ def _loaded(path: Path, device: str) -> PromptableSegmenter:
 
 
 def download() -> Path:
-    """Download config and weights of the large network into sam2/ of the first folder searched; returns the weights."""
+    """Download config and weights of the large network into sam2/ of the first search folder.
+
+    Returns the path of the weights.
+    """
     folder = folders()[0] / "sam2"
     return fetch(SOURCE, folder, _choose, f"put {' and '.join(FILES)} in {folder}")[1]
 
@@ -72,9 +75,9 @@ def _choose(files: list) -> list:
 
 
 def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
-    """The network with the weights of a file and the architecture of the config.json next to it; float32, eval mode.
+    """Load a network with the weights of a file and the architecture of the config.json next to it; float32, eval mode.
 
-    Raises MissingPackage where transformers is absent or older than SAM 2, and InputError for files that are damaged,
+    Raises MissingPackage if transformers is missing or too old for SAM 2, and InputError for files that are damaged,
     incomplete or of another network.
     """
     try:
@@ -110,7 +113,7 @@ def _config(kind: type, file: Path):
 
         decoder = Sam2VideoMaskDecoderConfig(**(data.get("mask_decoder_config") or {}))
         return kind.from_dict({**data, "mask_decoder_config": decoder})
-    except Exception as error:  # each release of transformers raises other types
+    except Exception as error:  # the exception type depends on the release of transformers
         raise InputError(f"{file}: does not describe SAM 2.1 ({' '.join(str(error).split())[:120]}); use the one "
                          f"published with the weights, as in {SOURCE.repository}") from error  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Client of OpenAI-compatible chat completion endpoints (many local servers are), standard library only."""
+"""Client for OpenAI-compatible chat completion endpoints, including many local servers; standard library only."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stages.core.errors import InputError
 
 log = logging.getLogger(__name__)
 URL = "https://api.openai.com/v1"
-ATTEMPTS, PAUSE = 3, 2.0  # on a busy or silent server; pause before the second attempt, then doubling [s]
-LONGEST_PAUSE = 60.0  # that a server may ask for with Retry-After [s]
+ATTEMPTS, PAUSE = 3, 2.0  # attempts with a busy or silent server; pause before the second, then doubled [s]
+LONGEST_PAUSE = 60.0  # longest pause accepted from a server's Retry-After header [s]
 RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # HTTP statuses worth retrying
-MAX_TIMEOUT = 86_400  # [s]; sockets take no infinite one
-LARGEST_REPLY = 4 << 20  # usable replies have a few thousand characters [bytes]
+MAX_TIMEOUT = 86_400  # largest timeout of a request [s]; sockets accept no infinite one
+LARGEST_REPLY = 4 << 20  # size at which reading a reply stops [bytes]; usable replies have a few thousand characters
 T = TypeVar("T")
 
 
@@ -32,11 +32,11 @@ class InvalidReply(ValueError):
 
 
 class _BrokenAnswer(Exception):
-    """An HTTP answer without a reply in it."""
+    """An HTTP response that does not contain a reply."""
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """A redirect is an error: the key would be sent to the other host, and the question turned into a GET."""
+    """Treats redirects as errors: they would send the key to the other host, and turn the request into a GET."""
 
     def redirect_request(self, *_):
         return None
@@ -49,11 +49,14 @@ class ChatEndpoint:
     url: str
     model: str
     key: str = ""  # sent if not empty; never printed
-    timeout: float = 120.0  # of one request [s]
+    timeout: float = 120.0  # timeout of one request [s]
 
     @staticmethod
     def from_environment(model: str = "", timeout: float = 120.0, url: str = "") -> ChatEndpoint:
-        """From OPENAI_API_KEY and, unless given, OPENAI_BASE_URL and OPENAI_MODEL; InputError for unusable values."""
+        """Build from OPENAI_API_KEY and, unless given, OPENAI_BASE_URL and OPENAI_MODEL.
+
+        Raises InputError for unusable values.
+        """
         url = (url or os.environ.get("OPENAI_BASE_URL", "").strip() or URL).rstrip("/")
         model = model or os.environ.get("OPENAI_MODEL", "").strip()
         key = os.environ.get("OPENAI_API_KEY", "").strip()
@@ -71,7 +74,7 @@ class ChatEndpoint:
         return ChatEndpoint(url, model, key, timeout)
 
     def ask(self, messages: list[dict]) -> str:
-        """Send messages; the text of the reply, which may be empty. Raises InputError when there is none."""
+        """Send messages; return the text of the reply, which may be empty. Raises InputError if there is no reply."""
         problem, pause = "", PAUSE
         for attempt in range(ATTEMPTS):
             if attempt:
@@ -92,9 +95,10 @@ class ChatEndpoint:
         raise InputError(f"{self.url}: {problem}, {ATTEMPTS} times; try later, or another OPENAI_BASE_URL")
 
     def ask_until_valid(self, messages: list[dict], parse: Callable[[str], T], tries: int) -> tuple[T, list[str]]:
-        """What `parse` makes of a reply, and all replies; an InvalidReply is sent back with its reason.
+        """Ask until `parse` accepts a reply; return its result, and all replies.
 
-        Raises InvalidReply with the last reason after `tries` replies, and InputError when there is no reply.
+        The reason of an InvalidReply is sent back to the model. Raises InvalidReply with the last reason after `tries`
+        replies, and InputError if there is no reply.
         """
         replies: list[str] = []
         while True:
@@ -137,7 +141,7 @@ class ChatEndpoint:
         return f"no connection ({' '.join(str(reason).split()) or type(reason).__name__})"
 
     def _why(self, error: urllib.error.HTTPError) -> str:
-        """The server's own error message, shortened, without the key."""
+        """Return the server's own error message, shortened, without the key."""
         try:
             said = json.loads(error.read(10_000))["error"]
             said = said["message"] if isinstance(said, dict) else said
@@ -152,12 +156,12 @@ def _is_address(url: str) -> bool:
         parts = urlsplit(url)
         return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0 and \
             parts.username is None  # fmt: skip
-    except ValueError:  # such as a port that is no number
+    except ValueError:  # such as a port that is not a number
         return False
 
 
 def _read(answer: HTTPResponse, end: float) -> bytes:
-    """The whole answer, until the time `end`: the timeout of a socket only limits the wait for the next byte."""
+    """Read the whole response until the time `end`; the timeout of a socket only limits the wait for the next byte."""
     blocks, size = [], 0
     while block := answer.read1(1 << 16):
         blocks.append(block)
@@ -166,7 +170,7 @@ def _read(answer: HTTPResponse, end: float) -> bytes:
             raise _BrokenAnswer(f"its answer is larger than {LARGEST_REPLY >> 20} MB")
         if time.monotonic() > end:
             raise TimeoutError
-    if answer.length:  # bytes that were announced and have not come
+    if answer.length:  # bytes that were announced but did not arrive
         raise IncompleteRead(b"", answer.length)
     return b"".join(blocks)
 
@@ -181,7 +185,7 @@ def _text(body: bytes) -> str:
 
 
 def _retry_after(error: urllib.error.HTTPError) -> float:
-    """Seconds that the server asks to wait, at most LONGEST_PAUSE; 0 where it names none (or a date)."""
+    """Return the seconds that the server asks to wait, at most LONGEST_PAUSE; 0 if it gives none, or a date."""
     try:
         seconds = float(error.headers.get("Retry-After", 0))
     except ValueError:
@@ -190,7 +194,10 @@ def _retry_after(error: urllib.error.HTTPError) -> float:
 
 
 def json_object(reply: str) -> dict:
-    """The one JSON object in a reply, which may stand in prose or a Markdown fence. Raises InvalidReply for others."""
+    """Parse the single JSON object in a reply, which may be within prose or a Markdown code fence.
+
+    Raises InvalidReply for any other reply.
+    """
     start = reply.find("{")
     if start < 0 or reply.lstrip().startswith("["):
         raise InvalidReply("it is not a JSON object")
@@ -220,5 +227,5 @@ _DECODER = json.JSONDecoder(object_pairs_hook=_once, parse_constant=_not_a_numbe
 
 
 def image_part(jpeg: bytes) -> dict:
-    """A JPEG image as a part of a message."""
+    """Return a JPEG image as a part of a message."""
     return {"type": "image_url", "image_url": {"url": "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()}}

@@ -1,4 +1,4 @@
-"""Model weights: find, verify, load and save NAME.safetensors with its metadata card NAME.json."""
+"""Find, verify, load and save the weights of models: NAME.safetensors, with a metadata card NAME.json."""
 
 from __future__ import annotations
 
@@ -29,17 +29,20 @@ MODELS = {
     "pointformer": "stages.core.models.baselines.pointformer:Pointformer",
     "transformer": "stages.core.models.baselines.transformer:Transformer",
 }
-MAX_CONFIG = 4096  # of widths and numbers of layers
-SHIPPED = Path(__file__).parent / "weights"  # shipped in the package
+MAX_CONFIG = 4096  # largest width or number of layers in a card
+SHIPPED = Path(__file__).parent / "weights"  # weights shipped in the package
 
 
 def build(name: str, **config) -> Dynamics:
-    """An untrained model by its name in MODELS, else InputError; `config`: arguments of its class."""
+    """Build an untrained model by its name in MODELS; `config` are the arguments of its class.
+
+    Raises InputError for an unknown name.
+    """
     return choose(MODELS, "MODEL", name)(**config)
 
 
 def find(name: str, given: Path | None = None) -> Path:
-    """Path of a model's weights: `given` (file or folder), else in $NGFF_WEIGHTS, else shipped.
+    """Return the path of a model's weights: `given` (file or folder), else in $NGFF_WEIGHTS, else as shipped.
 
     Raises InputError if there are none.
     """
@@ -59,25 +62,25 @@ def find(name: str, given: Path | None = None) -> Path:
 
 
 def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, half: bool = False) -> None:
-    """Write PATH.safetensors and its card PATH.json; `half`: in 16 bits where the values allow it."""
+    """Write PATH.safetensors and its card PATH.json; with `half` in 16 bits where the range of values allows it."""
     path = Path(path)
     state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
     if half:
         state = {k: v.half() if v.is_floating_point() and v.half().isfinite().all() else v for k, v in state.items()}
     with replacing(path) as part:
-        part.write_bytes(to_bytes(state))  # save_file creates files readable by their owner only
+        part.write_bytes(to_bytes(state))  # save_file would create files that only their owner can read
     write_card(path.with_suffix(".json"), {**(card or {}), "model": name, "config": model.config,
                                            "sha256": sha256(path)})  # fmt: skip
 
 
 def halve(path: Path) -> None:
-    """Rewrite a weight file in 16 bits; no measurable loss of accuracy (tests/core/models/test_shipped.py)."""
+    """Rewrite a weight file in 16 bits, without measurable loss of accuracy (tests/core/models/test_shipped.py)."""
     model, card = load(path)
     save(path, card["model"], model, card, half=True)
 
 
 def write_card(path: Path, card: Mapping) -> None:
-    """Write a card as JSON: a line for each entry and for each row of a table, numbers with eight digits."""
+    """Write a card as JSON: one line per entry and per row of a table, numbers with eight digits."""
     lines = []
     for key, value in _rounded(card).items():
         table = isinstance(value, list) and value and isinstance(value[0], dict)
@@ -88,7 +91,7 @@ def write_card(path: Path, card: Mapping) -> None:
 
 
 def _rounded(value: object) -> object:
-    """Nested values with floats of eight significant digits; None for infinities and nan."""
+    """Round floats in nested values to eight significant digits; infinities and nan become None."""
     if isinstance(value, float):
         return float(f"{value:.8g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -97,10 +100,10 @@ def _rounded(value: object) -> object:
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict]:
-    """A model in 32 bits and evaluation mode, and its card.
+    """Load a model in 32 bits and evaluation mode, and its card.
 
     The card's `model` and `config` define the model. A .pt or .pth file is read as a checkpoint of the public NGFF
-    code, without card. Raises InputError for files that are missing, damaged or do not fit.
+    code, which has no card. Raises InputError for files that are missing, damaged or do not fit.
     """
     path = Path(path)
     must_exist(path, "weights (.safetensors) such as `ngff-lab train` writes")
@@ -116,9 +119,9 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
 
 
 def _filled(name: str, config: Mapping, state: Mapping[str, Tensor]) -> Dynamics:
-    """The model with these weights. Raises TypeError, RuntimeError or ValueError where they do not fit."""
+    """Build a model with these weights. Raises TypeError, RuntimeError or ValueError if they do not fit."""
     _check_config(config)
-    with torch.device("meta"):  # shapes first: they may need any amount of memory
+    with torch.device("meta"):  # check shapes first, without memory: a wrong card could demand any amount
         build(name, **config).load_state_dict(state, assign=True)
     model = build(name, **config)
     model.load_state_dict(state)
@@ -126,7 +129,7 @@ def _filled(name: str, config: Mapping, state: Mapping[str, Tensor]) -> Dynamics
 
 
 def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
-    """Tensors of a .safetensors file in 32 bits; InputError where it is damaged or not the one of its card."""
+    """Read the tensors of a .safetensors file in 32 bits; InputError if it is damaged or does not match its card."""
     if sha256(path) != card["sha256"]:
         raise InputError(f"{path}: does not have the sha256 that {path.with_suffix('.json').name} states; the file is "
                          "damaged or of another training; fetch or train both again")  # fmt: skip
@@ -138,7 +141,7 @@ def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
 
 
 def _check_config(config: Mapping) -> None:
-    """ValueError for values that no model takes: layers without number are built one by one."""
+    """Raise ValueError for values that no model accepts, so that a huge number of layers is not built."""
     for name, value in config.items():
         if isinstance(value, float):  # dropout
             number(value, quote(name, 40), 0, 1)
@@ -147,7 +150,7 @@ def _check_config(config: Mapping) -> None:
 
 
 def read_card(path: Path, models: Collection[str]) -> dict:
-    """The card of weights, of one of these models: model, config and sha256. InputError where it is damaged."""
+    """Read the card (model, config, sha256) of weights of one of `models`. Raises InputError if it is damaged."""
     file = path.with_suffix(".json")
     must_exist(file, f"the card of {path.name}")
     try:
@@ -162,7 +165,7 @@ def read_card(path: Path, models: Collection[str]) -> dict:
 
 
 def _public(path: Path) -> Dynamics:
-    """A model from a checkpoint of the public code; sizes are inferred from the tensor shapes."""
+    """Load a model from a checkpoint of the public code; sizes are inferred from the tensor shapes."""
     state = _tensors(path, read_checkpoint(path))
     try:
         hidden = state["predictor.state_embedding.0.weight"].shape[0]
@@ -174,7 +177,7 @@ def _public(path: Path) -> Dynamics:
 
 
 def _tensors(path: Path, data: object) -> dict[str, Tensor]:
-    """The state dict in a checkpoint, up to three levels down, without the prefix of data-parallel training."""
+    """Find the state dict in a checkpoint, up to three levels down; removes the prefix of data-parallel training."""
     for _ in range(3):
         if isinstance(data, dict) and not any(isinstance(v, Tensor) for v in data.values()):
             data = next((data[k] for k in ("model_state_dict", "state_dict", "model") if k in data), None)
@@ -183,7 +186,7 @@ def _tensors(path: Path, data: object) -> dict[str, Tensor]:
 
 
 def unfit(path: Path, what: str, error: Exception) -> InputError:
-    """The error of weights that do not fit `what`."""
+    """Return the error for weights that do not fit `what`."""
     return InputError(f"{path}: does not fit {what} ({_line(error)})")
 
 

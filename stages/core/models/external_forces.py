@@ -23,7 +23,7 @@ class ExternalForces:
     torque: Float[Tensor, "b j 3"]  # about the centre of mass [N m]
     start: Float[Tensor, "b j"]  # [s]
     end: Float[Tensor, "b j"]  # [s]
-    point: Int[Tensor, "b j"]  # keypoint the force acts at; -1: at the centre of mass
+    point: Int[Tensor, "b j"]  # keypoint at which the force acts; -1: at the centre of mass
     pinned: Bool[Tensor, "b o"]  # objects that do not move
 
     @classmethod
@@ -33,16 +33,17 @@ class ExternalForces:
 
     @classmethod
     def none_for(cls, valid: Bool[Tensor, "b o n"], like: Tensor) -> ExternalForces:
-        """As `none`, from the `valid` mask alone, in the precision of `like`."""
+        """As `none`, but from the `valid` mask alone, in the precision of `like`."""
         b, o, _ = valid.shape
         whole, real, vector = valid.new_zeros(b, 0, dtype=torch.int64), like.new_zeros(b, 0), like.new_zeros(b, 0, 3)
         return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
 
     @classmethod
     def from_prompts(cls, initial: InitialConditions, prompts: ForcePrompts, ids: list[int]) -> ExternalForces:
-        """Forces and pins of a user's prompts for a batch of one scene, whose rows are the objects `ids`.
+        """Convert a user's prompts to forces and pins for a batch of one scene, whose rows are the objects `ids`.
 
-        A force at a point acts at the keypoint nearest to it. Velocities and lifts belong into `initial`.
+        A force at a point acts at the nearest keypoint. Velocities and lifts are not applied here; they belong in
+        `initial`.
         """
         real = {"dtype": initial.points.dtype, "device": initial.points.device}
         forces = prompts.forces
@@ -60,11 +61,11 @@ class ExternalForces:
         )
 
     def to(self, target: torch.device | str) -> ExternalForces:
-        """A copy on another device."""
+        """Return a copy on another device."""
         return ExternalForces(**{f.name: getattr(self, f.name).to(target) for f in fields(self)})
 
     def active_fraction(self, t: Tensor | float, dt: float = 0.0) -> Float[Tensor, "b j"]:
-        """Fraction of the time from `t` to `t + dt` [s] that each force acts; for dt = 0, 1 or 0 at the instant t."""
+        """Fraction of the time from `t` to `t + dt` [s] that each force acts; for dt = 0, 1 if it acts at time t."""
         if not dt:
             return ((self.start < t) & (t < self.end)).to(self.force)
         last = torch.clamp(self.end, max=t + dt)
@@ -91,7 +92,7 @@ class ExternalForces:
     def acceleration(
         self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], t: Tensor | float, dt: float = 0.0
     ) -> Float[Tensor, "b o n 3"]:
-        """Acceleration of every keypoint by the external forces, taking each object as rigid [m/s^2]."""
+        """Acceleration of every keypoint due to the external forces [m/s^2], with each object taken as rigid."""
         if not self.object.shape[1]:
             return torch.zeros_like(points)
         com = centre_of_mass(initial, points)

@@ -1,4 +1,4 @@
-"""Published weights on huggingface.co: local folders and explicit download."""
+"""Published weights on huggingface.co: search in local folders, and explicit download."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class HubSource:
 
 
 def folders() -> list[Path]:
-    """Folders searched for weights; downloads go into the first."""
+    """Return the folders searched for weights; downloads go into the first one."""
     given = os.environ.get("NGFF_WEIGHTS")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngff"
     return [*([Path(given)] if given else []), cache]
@@ -35,7 +35,7 @@ def folders() -> list[Path]:
 def find_or_download(
     find: Callable[[Path | None], Found], download: Callable[[], Found], given: Path | None, wanted: bool
 ) -> Found:
-    """What `find(given)` finds; if that is missing and `wanted`, downloaded, unless it was to be where it was `given`.
+    """Return `find(given)`; if nothing is found, a download is `wanted` and no place is `given`, `download()`.
 
     Raises the InputError of `find` or `download`.
     """
@@ -48,12 +48,13 @@ def find_or_download(
 
 
 def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:
-    """Download files of a repository into a folder through huggingface_hub; returns their paths.
+    """Download files of a repository into a folder through huggingface_hub; return their paths.
 
-    choose: picks files from those of the repository; may raise ValueError.
-    place: end of the error message, naming where to put manually downloaded files.
-    Size, licence and sha256, as stated by the hub, are logged before the download; files are checked against that
-    sha256. Raises InputError if the hub cannot be reached or a file is corrupt, and MissingPackage without the package.
+    choose: selects among the files of the repository; may raise ValueError.
+    place: part of the error message that tells where to put manually downloaded files.
+    Size, licence and sha256, as stated by the hub, are logged before the download, and files are checked against the
+    sha256. Raises InputError if the hub cannot be reached or a file is corrupt, and MissingPackage if huggingface_hub
+    is missing.
     """
     try:
         import huggingface_hub as hub
@@ -74,7 +75,7 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
         fetched = (hub.hf_hub_download(source.repository, f.rfilename, revision=info.sha, local_dir=folder)
                    for f in files)  # fmt: skip
         paths = [Path(path) for path in fetched]
-    except Exception as error:  # no network, no such repository, a gated one: each release raises its own
+    except Exception as error:  # no network, no or a gated repository: each release raises its own exception types
         raise InputError(
             f"--download: {source.repository} could not be fetched ({' '.join(str(error).split())[:120]}); fetch it "
             f"where there is a network, {place}, or name it with --weights"
@@ -89,5 +90,5 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
 
 
 def _checksum(file) -> str | None:
-    """The sha256 stated by the hub; only large files have one."""
+    """Return the sha256 stated by the hub; only large files have one."""
     return file.lfs.sha256 if file.lfs else None

@@ -1,7 +1,7 @@
 """Initial conditions of a batch of scenes, the input of every dynamics model: objects, materials and room.
 
-Lengths are metres, z is up. Scenes of a batch may have different numbers of objects and keypoints; the rest is padding,
-marked in `valid`, which never changes a result.
+Lengths are in metres, z is up. Scenes of a batch may have different numbers of objects and keypoints; the rest is
+padding, marked in `valid`, which never changes a result.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 FLOOR = -0.94  # height of the floor in the published simulation [m]
-BOX = ((-1.94, -1.94, FLOOR), (1.94, 1.94, 2.94))  # lower and upper corner of its room [m]
-GRAVITY = (0.0, 0.0, -5.0)  # of the published simulation [m/s^2]
+BOX = ((-1.94, -1.94, FLOOR), (1.94, 1.94, 2.94))  # lower and upper corner of the room in the published simulation [m]
+GRAVITY = (0.0, 0.0, -5.0)  # gravity in the published simulation [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -23,27 +23,27 @@ class InitialConditions:
 
     points: Float[Tensor, "b o n 3"]  # keypoints of the undeformed objects at time 0 [m]; 0 where padded
     valid: Bool[Tensor, "b o n"]  # False where padded
-    mass_fraction: Float[Tensor, "b o n"]  # of each keypoint in its object's mass; sums to 1, 0 where padded
+    mass_fraction: Float[Tensor, "b o n"]  # share of each keypoint in its object's mass; sums to 1, 0 where padded
     mass: Float[Tensor, "b o"]  # [kg]
     E: Float[Tensor, "b o"]  # Young's modulus [Pa]
-    solidity: Float[Tensor, "b o"]  # stiffness relative to a hollow or thin body of that modulus, see field.solidity
+    solidity: Float[Tensor, "b o"]  # stiffness relative to a hollow or thin body of the same E, see field.solidity
     nu: Float[Tensor, "b o"]  # Poisson's ratio
     friction: Float[Tensor, "b o"]  # Coulomb coefficient
     loss: Float[Tensor, "b o"]  # loss factor of the material, see physics.materials
     velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
     spin: Float[Tensor, "b o 3"]  # angular velocity, world axes [rad/s]
     gravity: Float[Tensor, "b 3"]  # [m/s^2]
-    body_inertia: Float[Tensor, "b o 3 3"]  # tensor about the centre of mass at time 0, per unit of mass [m^2]
+    body_inertia: Float[Tensor, "b o 3 3"]  # inertia about the centre of mass at time 0, per unit of mass [m^2]
     box: Float[Tensor, "b o 2 3"]  # lower and upper corner of the room for each object; the floor is the lower z [m]
 
     @classmethod
     def of(
         cls, points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"] | None = None, **given: Tensor
     ) -> InitialConditions:
-        """Initial conditions of keypoints, other fields by keyword; tensors are broadcast to their field's shape.
+        """Build initial conditions from keypoints; other fields by keyword, broadcast to their shape.
 
         Defaults: 1 kg, 1e5 Pa, solidity 1, Poisson 0.3, friction 0.5, loss factor 0.1, at rest, the published gravity
-        and room, and the inertia of the keypoints, which are those of a hollow body.
+        and room, and the inertia of the keypoints, which is that of a hollow body.
         Raises TypeError for an unknown field.
         """
         b, o, n, _ = points.shape
@@ -72,7 +72,7 @@ class InitialConditions:
             name: torch.as_tensor(given.pop(name, default.get(name))).to(points)
             for name in ("mass_fraction", "body_inertia", *default)
         }
-        # contiguous, or kernels would copy them at every step
+        # contiguous, since kernels would otherwise copy them at every step
         filled = {name: x.expand(shape.get(name, (b, o))).contiguous() for name, x in filled.items()}
         if given:
             raise TypeError(f"InitialConditions has no field {', '.join(given)}")
@@ -80,7 +80,7 @@ class InitialConditions:
 
     @property
     def present(self) -> Bool[Tensor, "b o"]:
-        """Objects that are not padding."""
+        """Mask of objects that are not padding."""
         return self.valid.any(-1)
 
     @property
@@ -89,7 +89,7 @@ class InitialConditions:
         return self.box[..., 0, 2]
 
     def to(self, target: torch.device | torch.dtype | str) -> InitialConditions:
-        """A copy on another device or in another precision (`valid` stays boolean)."""
+        """Return a copy on another device or in another precision (`valid` stays boolean)."""
         dtype = isinstance(target, torch.dtype)
         moved = {f.name: getattr(self, f.name) for f in fields(self)}
         return InitialConditions(
@@ -117,8 +117,8 @@ def offsets(initial: InitialConditions, points: Float[Tensor, "b o n 3"]) -> Flo
 def inertia(mass_fraction: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o 3 3"]:
     """Inertia tensor per unit of mass about the origin of `arm` [m^2].
 
-    A thousandth of the trace (and 1 mm^2, for a single point) is added to the diagonal, so that the tensor of a rod or
-    a point is invertible.
+    A thousandth of the trace of the second moments, plus 1 mm^2, is added to the diagonal, so that the tensor of a rod
+    or of a single point is invertible.
     """
     moment = torch.einsum("boni,bonj->boij", mass_fraction[..., None] * arm, arm)
     trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]

@@ -1,12 +1,12 @@
 """ODE solvers for dynamics models: torchdiffeq applied to states that are named tuples of tensors.
 
-The published model is integrated with explicit Euler steps of a frame or, adaptively, with dopri5 (TOLERANCE below).
-torchdiffeq runs in `Dynamics.rollout` and `rollout.TimeStepper` whenever the method is one of METHODS, as by `ngff
-simulate --integrator`, and for gradients by the adjoint equation. The default method "step" is a model's own step:
-explicit Euler for the models that are plain ODEs (`gcn`, `pointformer`, `transformer`, `ngff-paper`), equal to "euler"
-up to rounding; for `ngff` a splitting with implicit springs, friction and a penetration limit, which a general ODE
+The published model is integrated with explicit Euler steps of one frame or, adaptively, with dopri5 (TOLERANCE below).
+`Dynamics.rollout` and `rollout.TimeStepper` use torchdiffeq if the method is one of METHODS, as with `ngff simulate
+--integrator`, and for gradients by the adjoint equation. The default method "step" is a model's own step. For models
+that are plain ODEs (`gcn`, `pointformer`, `transformer`, `ngff-paper`) it is explicit Euler, equal to "euler" up to
+rounding; for `ngff` it is a splitting with implicit springs, friction and a penetration limit, which a general ODE
 solver does not offer. With the shipped weights of `ngff`, rk4 agrees with this step to millimetres in first contacts,
-euler with steps of a frame diverges, and dopri5 fails at stiff contacts.
+euler with steps of one frame diverges, and dopri5 fails at stiff contacts.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from torch import Tensor
 from stages.core.errors import InputError
 
 METHODS = ("euler", "rk4", "dopri5")
-TOLERANCE = {"rtol": 1e-3, "atol": 1e-4}  # of dopri5, as published
+TOLERANCE = {"rtol": 1e-3, "atol": 1e-4}  # tolerances of dopri5, as published
 State = TypeVar("State", bound=tuple)  # a NamedTuple of tensors
 
 
 @dataclass(frozen=True)
 class Integration:
-    """How a rollout is integrated. Raises ValueError for an adjoint without an ODE solver."""
+    """Time integration of a rollout. Raises ValueError for an adjoint without an ODE solver."""
 
     method: str = "step"  # the model's own step, or one of METHODS
     substeps: int = 1  # equal parts that each frame is divided into; dopri5 chooses its own steps
@@ -42,13 +42,13 @@ def solve_ode(
     rate: Callable[[Tensor, State], State], start: State, times: Tensor, method: str = "euler", substeps: int = 1,
     adjoint: Sequence[Tensor] | None = None,
 ) -> State:  # fmt: skip
-    """States at `times` [s], stacked along a new first dimension; the first is `start`.
+    """Return the states at `times` [s], stacked along a new first dimension; the first is `start`.
 
-    rate: time derivative of a state at a time.
-    method: euler and rk4 step from time to time in `substeps`; dopri5 chooses its steps, the same for a whole batch.
+    rate: time derivative of a state at a given time.
+    method: euler and rk4 divide each interval into `substeps`; dopri5 chooses its steps, the same for a whole batch.
     adjoint: tensors that get gradients from the adjoint equation (memory of one step; Chen et al. 2018, "Neural
         Ordinary Differential Equations"); without it gradients are backpropagated through the steps.
-    Raises InputError for an unknown method and where the step of dopri5 vanishes, as at stiff contacts.
+    Raises InputError for an unknown method, and if the step of dopri5 underflows, as at stiff contacts.
     """
     from torchdiffeq import odeint, odeint_adjoint  # imports scipy.optimize, which the method "step" does not need
 
@@ -76,7 +76,7 @@ def solve_ode(
 
 
 def _subdivided(t: Tensor, substeps: int) -> Tensor:
-    """Times with each interval of `t` divided into equal parts."""
+    """Divide each interval of the times `t` into equal parts."""
     part = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
     inner = t[:-1, None] + part * t.diff()[:, None]
     return torch.cat([inner.flatten(), t[-1:]])

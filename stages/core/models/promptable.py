@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-# label of each point of a prompt, numbered as in the public code of SAM; a box is given by its two corners
+# labels of the points of a prompt, numbered as in the public code of SAM; a box is given by two corners
 BACKGROUND_POINT, FOREGROUND_POINT, BOX_TOP_LEFT, BOX_BOTTOM_RIGHT = 0, 1, 2, 3
 
 
@@ -47,16 +47,16 @@ class PromptableSegmenter(Protocol):
     """
 
     def preprocess(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 s s"]:
-        """The network input for a photo (RGB, 0..1)."""
+        """Return the network input for a photo (RGB, 0..1)."""
         ...
 
     def propose_masks(self, pixels: Float[Tensor, "3 s s"]) -> Bool[Tensor, "m l l"]:
-        """Masks of all regions of a photo, without prompts; they may overlap and include parts of objects."""
+        """Return masks of all regions of a photo, without prompts; they may overlap, and include parts of objects."""
         ...
 
     def propagate(self, frame: FrameReader, count: int, prompts: Prompts, start: int = 0) -> MaskLogits:
-        """Mask logits (positive inside) of all objects for each of `count` frames, in any order of frames.
+        """Yield mask logits (positive inside) of all objects for each of `count` frames, in any order of frames.
 
-        `prompts` mark one object each in frame `start`.
+        Each of the `prompts` marks one object in frame `start`.
         """
         ...

@@ -1,12 +1,12 @@
-"""Fast rollouts without gradients: on CUDA, `prepare` and `step` are captured as CUDA graphs, when first used again.
+"""Fast rollouts without gradients; on CUDA, `prepare` and `step` are captured as CUDA graphs.
 
     stepper = TimeStepper(model, initial)
     for _ in range(steps):
         stepper.step()
         stepper.points  # positions of the keypoints at the new time
 
-A step of a model launches hundreds of small kernels; launching them one by one takes about ten times as long as their
-work. A graph launches all of them at once.
+A step of a model launches hundreds of small kernels; launching them one by one takes about ten times as long as running
+them. A graph launches all of them at once. `step` is captured at its first call, `prepare` at the first `restart`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from stages.core.models.trees import leaf_tensors, replace_tensors
 class TimeStepper:
     """A batch of scenes that advances by dt [s] with every `step`.
 
-    `state`, `points` [m], `external` and `step_count` are tensors at fixed addresses: their contents change, and
+    `state`, `points` [m], `external` and `step_count` are tensors at fixed addresses: only their contents change, and
     `external` and `step_count` may be written to between steps.
-    `method`: "step", the model's own, or a solver of `integrate.METHODS`. Only "step" is captured as a CUDA graph,
-    because the solvers of torchdiffeq synchronise with the host.
+    `method` is "step", the model's own step, or a solver of `integrate.METHODS`. Only "step" is captured as a CUDA
+    graph, because the solvers of torchdiffeq synchronise with the host.
     """
 
     @torch.no_grad()
@@ -59,27 +59,27 @@ class TimeStepper:
 
     @torch.no_grad()
     def restart(self, initial: InitialConditions, external: ExternalForces | None = None) -> None:
-        """Start again at time 0 from inputs of the same shapes. Raises ValueError for other shapes."""
+        """Restart at time 0 from inputs of the same shapes. Raises ValueError for other shapes."""
         external = ExternalForces.none(initial) if external is None else external
         _load((self.initial, self.external), (initial, external))
         if not self.step_count.is_cuda:
             return self._begin()
-        if self._replay_begin is None:  # the scene then lies in the memory of this graph, which steps must read
+        if self._replay_begin is None:  # recapture the step too: it must read the scene in the memory of this graph
             self._replay_begin, self._replay_step = _captured(self._begin), None
         self._replay_begin()
 
     @torch.no_grad()
     def change(self, initial: InitialConditions) -> None:
-        """Continue from the present state with other masses, materials or gravity, for the same shapes."""
+        """Continue from the current state with other masses, materials or gravity, for the same shapes."""
         _load((self.initial,), (initial,))
         _load((self.scene,), (self.model.prepare(self.initial),))
 
     def saved(self) -> list[Tensor]:
-        """A copy of what a step changes, for `restore`."""
+        """Return a copy of the tensors that a step changes, for `restore`."""
         return [x.clone() for x in self._changing]
 
     def restore(self, saved: list[Tensor]) -> None:
-        """Return to the state that `saved` gave."""
+        """Return to the state that `saved` returned."""
         torch._foreach_copy_(self._changing, saved)
 
     @property
@@ -87,7 +87,7 @@ class TimeStepper:
         return [*self.state, self.points, self.step_count]
 
     def _prepared(self) -> tuple[Any, tuple, Tensor]:
-        """The scene, its state at time 0 and the positions of its keypoints."""
+        """Return the scene, its state at time 0 and the positions of its keypoints."""
         scene = self.model.prepare(self.initial)
         state = self.model.initial_state(scene)
         return scene, state, self.model.points(scene, state)
@@ -98,15 +98,15 @@ class TimeStepper:
         self.step_count.zero_()
 
     def _step(self) -> None:
-        """Advance in place; time is counted in steps, so that it stays exact."""
+        """Advance in place; time is counted in steps, so that it does not accumulate rounding errors."""
         interval = self.step_count.to(self.state[0]) * self.dt, self.dt
         new = self.model.advance(self.scene, self.state, interval, self.external, self.method)
-        # on a GPU one kernel for all copies
+        # one kernel for all copies on a GPU
         torch._foreach_copy_([*self.state, self.points], [*new, self.model.points(self.scene, new)])
         self.step_count += 1
 
     def _captured_step(self) -> Callable[[], None]:
-        """`_step` as a CUDA graph, with the state as before the capture, which takes some steps."""
+        """Capture `_step` as a CUDA graph, and restore the state, since the capture runs some steps."""
         before = self.saved()
         replay = _captured(self._step)
         self.restore(before)
@@ -114,7 +114,7 @@ class TimeStepper:
 
 
 def _copy(tree: Any) -> Any:
-    """The same structure with contiguous copies of its tensors."""
+    """Return the same structure with contiguous copies of its tensors."""
     return replace_tensors(tree, (x.clone(memory_format=torch.contiguous_format) for x in leaf_tensors(tree)))
 
 
@@ -122,13 +122,13 @@ def _load(target: tuple, source: tuple) -> None:
     for x, y in zip(leaf_tensors(target), leaf_tensors(source), strict=True):
         if x.shape != y.shape:
             raise ValueError(f"made for {tuple(x.shape)}, not {tuple(y.shape)}")
-    torch._foreach_copy_(list(leaf_tensors(target)), list(leaf_tensors(source)))  # on a GPU one kernel for all
+    torch._foreach_copy_(list(leaf_tensors(target)), list(leaf_tensors(source)))  # one kernel for all on a GPU
 
 
 def _captured(work: Callable[[], None]) -> Callable[[], None]:
-    """`work` as a CUDA graph; calling the result replays its kernel launches.
+    """Capture `work` as a CUDA graph; calling the result replays its kernel launches.
 
-    `work` runs twice before the capture, which loads and tunes kernels; the capture itself does not execute them.
+    `work` runs twice before the capture, to load and tune kernels; the capture itself does not execute them.
     """
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -141,7 +141,7 @@ def _captured(work: Callable[[], None]) -> Callable[[], None]:
 
 @torch.no_grad()
 def record_frames(stepper: TimeStepper, steps: int) -> Float[Tensor, "b t o n 3"]:
-    """Keypoints [m] now and after each of steps - 1 further steps; undefined where padded."""
+    """Return keypoints [m] now and after each of `steps` - 1 further steps; undefined where padded."""
     b, o, n, _ = stepper.points.shape
     out = stepper.points.new_empty(b, steps, o, n, 3)
     for t in range(steps):

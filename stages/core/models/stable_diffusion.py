@@ -1,4 +1,7 @@
-"""Parts of a published Stable Diffusion in the layout of diffusers: tokenizer, text encoder, networks, scheduler."""
+"""Load the parts of a published Stable Diffusion in the layout of diffusers.
+
+The parts are tokenizer, text encoder, networks and scheduler.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +24,11 @@ if TYPE_CHECKING:
 def read_parts(
     folder: Path, names: tuple[str, ...], scheduler: Callable[[dict], Any], user: str, version: str, source: HubSource
 ) -> dict[str, Any]:
-    """The parts by the names of their subfolders, networks in 32 bit, the scheduler made from its configuration.
+    """Read parts by the names of their subfolders: networks in 32 bit, and `scheduler` of its configuration.
 
-    `user`: the network that needs them, `version`: of Stable Diffusion. Raises MissingPackage without diffusers or
-    transformers, and InputError for files that are damaged or lack tensors, and where `scheduler` raises ValueError.
+    For error messages, `user` is the network that needs the parts, and `version` the version of Stable Diffusion.
+    Raises MissingPackage without diffusers or transformers, and InputError for files that are damaged or lack tensors,
+    and if `scheduler` raises ValueError.
     """
     try:
         import diffusers
@@ -53,7 +57,7 @@ def read_parts(
 
 
 def _network(kind: type, folder: Path, **how) -> nn.Module:
-    """A library's model from its folder; ValueError for missing tensors (the library would fill in random ones)."""
+    """Load a library's model from its folder; ValueError for missing tensors, which the library would randomise."""
     model, found = kind.from_pretrained(
         folder, local_files_only=True, use_safetensors=True, output_loading_info=True, **how
     )
@@ -63,7 +67,7 @@ def _network(kind: type, folder: Path, **how) -> nn.Module:
 
 
 def encode_prompts(tokenizer: CLIPTokenizer, encoder: CLIPTextModel, prompts: list[str]) -> Float[Tensor, "b n d"]:
-    """Last hidden states of the text encoder, of prompts cut or padded to its length."""
+    """Return the last hidden states of the text encoder for prompts truncated or padded to its length."""
     length = encoder.config.max_position_embeddings
     tokens = tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
     return encoder(tokens.input_ids.to(encoder.device))[0]

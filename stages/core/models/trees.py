@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def leaf_tensors(tree: Any) -> Iterator[Tensor]:
-    """All tensors in nested tuples and dataclasses, in order."""
+    """Yield all tensors in nested tuples and dataclasses, in order."""
     if isinstance(tree, Tensor):
         yield tree
     elif is_dataclass(tree):
@@ -22,7 +22,7 @@ def leaf_tensors(tree: Any) -> Iterator[Tensor]:
 
 
 def replace_tensors(tree: Any, new: Iterator[Tensor]) -> Any:
-    """The same structure with its tensors replaced, in the order of `leaf_tensors`."""
+    """Return the same structure with its tensors replaced, in the order of `leaf_tensors`."""
     if isinstance(tree, Tensor):
         return next(new)
     if is_dataclass(tree):

@@ -1,1 +1,1 @@
-"""Networks: tensors in, tensors out."""
+"""Neural networks: dynamics models, segmentation, reconstruction, feature matching and image generation."""

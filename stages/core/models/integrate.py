@@ -69,7 +69,7 @@ def solve_ode(
             return kind(*odeint(f, tuple(start), times, **settings))
         params = tuple(p for p in adjoint if p.requires_grad)
         return kind(*odeint_adjoint(f, tuple(start), times, adjoint_params=params, **settings))
-    except AssertionError as error:  # of torchdiffeq
+    except AssertionError as error:  # raised by torchdiffeq
         if "underflow" not in str(error):
             raise
         raise InputError(f"{method}: the step became too small for these forces; use rk4 or step") from error

@@ -22,8 +22,8 @@ ZERO, ONE, TINY = wp.constant(f64(0.0)), wp.constant(f64(1.0)), wp.constant(f64(
 class Velocities:
     """Velocities of the bodies of each scene."""
 
-    linear: wp.array2d[wp.vec3d]  # of the centres of mass [m/s]
-    angular: wp.array2d[wp.vec3d]  # [rad/s]
+    linear: wp.array2d[wp.vec3d]  # velocity of the centre of mass [m/s]
+    angular: wp.array2d[wp.vec3d]  # angular velocity [rad/s]
 
 
 @wp.struct
@@ -59,7 +59,7 @@ class Contacts:
     active_count: wp.array[int]
     a: wp.array2d[int]
     b: wp.array2d[int]
-    normal: wp.array2d[wp.vec3d]  # from b to a
+    normal: wp.array2d[wp.vec3d]  # contact normal, from b to a
     arm_a: wp.array2d[wp.vec3d]  # contact point relative to the centre of mass of a [m]
     arm_b: wp.array2d[wp.vec3d]  # contact point relative to the centre of mass of b [m]
     target: wp.array2d[f64]  # smallest normal speed of a relative to b that is allowed after the step [m/s]

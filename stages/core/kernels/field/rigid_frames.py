@@ -81,7 +81,8 @@ def _begin(bodies: BodyProperties, world: CollisionWorld, solver: ContactSolver,
     world.motion.spin[scene, i] = spin
     world.motion.R[scene, i] = R
     reach = world.surfaces.reach[i]
-    way = h * (wp.length(velocity + h * bodies.acceleration[scene, i]) + wp.length(later) * reach)  # without contact
+    # upper bound of the distance that the body's surface travels in a substep without contact [m]
+    way = h * (wp.length(velocity + h * bodies.acceleration[scene, i]) + wp.length(later) * reach)
     world.motion.margin[scene, i] = wp.max(MARGIN + h * (wp.length(velocity) + wp.length(spin) * reach), way)
     turn = _double_matrix(R)
     solver.inertia.tensor[scene, i] = mass * (turn * _double_matrix(bodies.inertia[scene, i]) * wp.transpose(turn))

@@ -41,12 +41,12 @@ class ContactNet(nn.Module):
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
         super().__init__()
-        self.input_layer = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)  # of the invariant features
-        self.own_projection = nn.Linear(hidden, hidden)  # of the object's embedding
-        self.partner_projection = nn.Linear(hidden, hidden) if partner else None  # of the partner's embedding
-        self.message = mlp(hidden, hidden, hidden + 1)  # message and attention logit
-        self.context_projection = nn.Linear(hidden, hidden)  # of the context
-        self.decoder = mlp(hidden, hidden, vectors, output_scale=0.1)  # weights of the vector features
+        self.input_layer = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)  # input: invariant features
+        self.own_projection = nn.Linear(hidden, hidden)  # input: the object's embedding
+        self.partner_projection = nn.Linear(hidden, hidden) if partner else None  # input: the partner's embedding
+        self.message = mlp(hidden, hidden, hidden + 1)  # output: message and attention logit
+        self.context_projection = nn.Linear(hidden, hidden)  # input: the context
+        self.decoder = mlp(hidden, hidden, vectors, output_scale=0.1)  # output: weights of the vector features
 
     def encode(
         self, contacts: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],

@@ -30,7 +30,7 @@ class DeformationInputs(NamedTuple):
     """Per-step inputs of the deformation network, in the body frame."""
 
     u: Float[Tensor, "b o n 3"]  # displacements [m]
-    du: Float[Tensor, "b o n 3"]  # their rates [m/s]
+    du: Float[Tensor, "b o n 3"]  # rates of the displacements [m/s]
     contact: Float[Tensor, "b o n 3"]  # accelerations of the keypoints by contact [m/s^2]
     gravity: Float[Tensor, "b o 3"]  # [m/s^2]
 
@@ -43,10 +43,10 @@ class DeformationNet(nn.Module):
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.input_layer = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)  # of the invariant features
-        self.embedding_projection = nn.Linear(hidden, hidden)  # of the object's embedding
-        self.decoder = mlp(hidden, hidden, 3 * SCALE_COUNT, output_scale=0.1)  # weights of the vector features
-        self.spring_constants = mlp(hidden, hidden, 2)  # stiffness and damping, from the embedding
+        self.input_layer = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)  # input: invariant features
+        self.embedding_projection = nn.Linear(hidden, hidden)  # input: the object's embedding
+        self.decoder = mlp(hidden, hidden, 3 * SCALE_COUNT, output_scale=0.1)  # output: weights of the vector features
+        self.spring_constants = mlp(hidden, hidden, 2)  # stiffness and damping from the embedding
 
     def springs(self, embedding: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
         """Return stiffness [1/s^2] and damping [1/s] of each object."""

@@ -22,7 +22,7 @@ class BodyState(NamedTuple):
     velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
     momentum: Float[Tensor, "b o 3"]  # angular, about the centre of mass, per unit of mass, world axes [m^2/s]
     u: Float[Tensor, "b o n 3"]  # displacement from the rest shape, body frame [m]
-    du: Float[Tensor, "b o n 3"]  # its rate [m/s]
+    du: Float[Tensor, "b o n 3"]  # rate of the displacement [m/s]
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class FieldScene:
     """Values computed once per rollout: the rest shapes, and the network outputs for shape and material."""
 
     shape: RestShape
-    embedding: Float[Tensor, "b o h"]  # of each object's shape and material
-    stiffness: Float[Tensor, "b o"]  # of the springs that restore the rest shape, per unit of mass [1/s^2]
-    damping: Float[Tensor, "b o"]  # of the displacement rates [1/s]
+    embedding: Float[Tensor, "b o h"]  # embedding of each object's shape and material
+    stiffness: Float[Tensor, "b o"]  # stiffness of the springs to the rest shape, per unit of mass [1/s^2]
+    damping: Float[Tensor, "b o"]  # damping of the displacement rates [1/s]
     compliance_scale: Float[
         Tensor, "b o"
     ]  # stiffness given to the network / true stiffness; 1 within the trained range

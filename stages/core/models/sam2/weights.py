@@ -52,7 +52,7 @@ def load_segmenter(given: Path | None, download_missing: bool, device: str) -> P
 
 @lru_cache(maxsize=1)
 def _loaded(path: Path, device: str) -> PromptableSegmenter:
-    model = load(path, device)  # explains the absence of transformers, which the next line imports
+    model = load(path, device)  # first, since it raises a clear error if transformers, imported below, is missing
     from stages.core.models.sam2.segmenter import Sam2Segmenter
 
     return Sam2Segmenter(model)

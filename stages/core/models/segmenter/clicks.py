@@ -28,7 +28,7 @@ CLICK_REACH = 0.03  # largest distance of a click from the nearest surfel of a c
 class Click:
     """A point on an object."""
 
-    point: Float[Tensor, "3"]  # on its surface, world frame
+    point: Float[Tensor, "3"]  # point on the object's surface, world frame
     object: int  # 1 or more
     text: str  # as the user gave it, for messages
 

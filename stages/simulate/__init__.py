@@ -1,1 +1,1 @@
-"""scene.ply to traj.h5."""
+"""Simulation: scene.ply -> traj.h5."""

@@ -1,7 +1,7 @@
-"""The background of a scene of photos as fixed boxes: what stands around the objects and is not one of them.
+"""Collision boxes for the background of a scene of photos: everything above the floor that is not an object.
 
-The opaque Gaussians above the floor are counted in voxels. Voxels next to an object, which may be its halo, and small
-groups of voxels are left out; the rest is merged into boxes.
+Opaque Gaussians of the background are counted in an occupancy grid. Voxels next to an object, which may be its halo,
+and small connected components are left out; the remaining voxels are merged into boxes.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from scipy import ndimage
 from stages.core.physics.particles import usable
 from stages.core.scene.scene import Scene
 
-VOXELS_ALONG = 64  # voxels along the region that is examined
-REACH = 0.5  # of the region beyond the objects, relative to their extent
-OBSTACLE_OPACITY = 0.5  # above which a Gaussian of the background can be hit
-MIN_COUNT = 2  # Gaussians in a full voxel
-MIN_HEIGHT = 2  # voxels above the floor that are left out: the floor is a plane
-MIN_GROUP = 20  # voxels of the smallest group
+VOXELS_ALONG = 64  # voxels along the longest side of the grid
+REACH = 0.5  # distance by which the grid extends beyond the objects, relative to their extent
+OBSTACLE_OPACITY = 0.5  # opacity above which a Gaussian of the background is solid
+MIN_COUNT = 2  # smallest number of Gaussians in an occupied voxel
+MIN_HEIGHT = 2  # layers of voxels above the floor that are left out, since the floor itself is a plane [voxels]
+MIN_GROUP = 20  # size of the smallest connected component that is kept [voxels]
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def background_boxes(scene: Scene, floor: float) -> list[Box]:
-    """Lower and upper corners of boxes, in scene units."""
+    """Lower and upper corners of fixed boxes around the objects; `floor` is the height of the floor [scene units]."""
     g = scene.gaussians.to("cpu")
     good = usable(g) & (g.opacities > OBSTACLE_OPACITY)
     means, own = g.means[good].double().numpy(), (g.object_id[good] > 0).numpy()
@@ -48,7 +48,10 @@ def background_boxes(scene: Scene, floor: float) -> list[Box]:
 
 
 def merged(full: np.ndarray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Boxes of cells, first and one beyond the last, that cover the full cells once: each grown in z, y and then x."""
+    """Disjoint boxes that cover the occupied cells: first cell and one beyond the last.
+
+    Greedy: each box grows from the first uncovered cell along z, then y, then x.
+    """
     left, boxes = full.copy(), []
     for x, y, z in np.argwhere(full):
         if not left[x, y, z]:

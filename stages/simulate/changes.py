@@ -1,4 +1,4 @@
-"""Conditions that change during a simulation: the options that hold from then on."""
+"""Changes of gravity, friction, materials and pins during a simulation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.simulate.options import SimulateOptions
 
 
 def changed_options(options: SimulateOptions, changes: Sequence[Change]) -> SimulateOptions:
-    """The options with other gravity, friction and materials."""
+    """Apply changes of gravity, friction and materials to the options."""
     for c in changes:
         if c.what == "material":
             options = replace(options, material=(*options.material, f"{c.object_id}={c.value}"))
@@ -20,7 +20,7 @@ def changed_options(options: SimulateOptions, changes: Sequence[Change]) -> Simu
 
 
 def changed_pins(pinned: frozenset[int], changes: Sequence[Change]) -> frozenset[int]:
-    """The ids of the objects that are held at their position."""
+    """Apply changes of pins to the ids of the pinned objects."""
     for c in changes:
         if c.what == "pinned":
             pinned = pinned | {c.object_id} if c.value else pinned - {c.object_id}

@@ -1,8 +1,8 @@
-"""Contacts between the curved sides of cylinders, in place of MuJoCo's.
+"""Contacts between the curved sides of cylinders, which replace those of MuJoCo.
 
-MuJoCo finds one contact for two cylinders side by side, at one end or the other, and where they just touch a normal and
-a depth that are far off. Here they touch where their axes cross, and at both ends of the length along which they are
-beside each other. Contacts with an end of a cylinder stay MuJoCo's.
+For two cylinders side by side MuJoCo finds only one contact, at one end or the other, and its normal and depth are far
+off where the cylinders just touch. Here there are contacts where the axes cross, and at both ends of the length along
+which the cylinders lie side by side. Contacts with the flat ends of cylinders are MuJoCo's.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.simulate.surface_contacts import AddedContacts, add_contacts
 
-LEANING = 0.1  # sine of the angle between an axis and the plane across which sides touch: beyond, edges do
+LEANING = 0.1  # sine of the angle between an axis and the tangent plane above which edges touch instead of sides
 
 
 class CylinderContacts:
@@ -25,7 +25,7 @@ class CylinderContacts:
         self._pairs = geoms[pairs[moves[pairs].any(1)]]
 
     def replace(self, data) -> None:
-        """Exclude MuJoCo's contacts of pairs whose sides touch, and add others."""
+        """Replace MuJoCo's contacts of the pairs whose sides touch."""
         if not len(self._pairs):
             return
         model, (a, b) = self._model, self._pairs.T
@@ -44,7 +44,7 @@ class CylinderContacts:
         found = data.contact.geom
         replaced = np.isin(found.min(1) * count + found.max(1), numbers)
         data.contact.exclude[replaced] = 1
-        data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        data.contact.efc_address[replaced] = -1  # MuJoCo leaves it undefined if all contacts are excluded
         k = np.flatnonzero(depth > -model.geom_margin[pairs[row]].max(1))
         add_contacts(self._mujoco, model, data, AddedContacts(x[k], normal[k], depth[k], pairs[row[k]]))
 
@@ -52,14 +52,15 @@ class CylinderContacts:
 def side_contacts(
     centre: np.ndarray, axis: np.ndarray, radius: np.ndarray, half: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Contacts of the sides of pairs (k, 2) of cylinders; negative depths are gaps.
+    """Contacts between the sides of k pairs of cylinders.
 
-    `half` is half their length. Rows (n,) of the pairs, positions (n, 3), normals (n, 3) from the first to the second
-    cylinder, depths (n,); and which pairs (k,) are beside each other, so that their sides touch if anything does.
+    `centre` and `axis` (unit vectors) are (k, 2, 3), `radius` and `half` (half the length) are (k, 2). Returns the rows
+    (n,) of the pairs, contact points (n, 3), normals (n, 3) from the first to the second cylinder, and depths (n,),
+    negative for gaps; and a mask (k,) of the pairs that lie side by side, so that only their sides can touch.
     """
     (a, b), (u, v), between = centre.swapaxes(0, 1), axis.swapaxes(0, 1), centre[:, 1] - centre[:, 0]
     cosine, along_u, along_v = ((one * two).sum(1) for one, two in ((u, v), (between, u), (between, v)))
-    # places s on the first axis of which the nearest one of the second axis, s cosine - along_v, is on that cylinder
+    # s from `low` to `high` on the first axis: the nearest point of the second axis, at s cosine - along_v, is on it
     slope = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
     ends = (along_v + np.array([[-1.0], [1.0]]) * half[:, 1]) / slope
     low, high = np.maximum(ends.min(0), -half[:, 0]), np.minimum(ends.max(0), half[:, 0])
@@ -68,7 +69,7 @@ def side_contacts(
     nearest = np.where(across > 1e-12, nearest, (low + high) / 2).clip(low, np.maximum(low, high))
     s = np.stack([low, nearest, high], 1)
     t = s * cosine[:, None] - along_v[:, None]
-    way = (b - a)[:, None] + t[..., None] * v[:, None] - s[..., None] * u[:, None]  # between the axes, (k, 3, 3)
+    way = (b - a)[:, None] + t[..., None] * v[:, None] - s[..., None] * u[:, None]  # from axis to axis, (k, 3, 3)
     distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
     normal = way / distance[..., None]
     leaning = np.abs((normal * u[:, None]).sum(2))

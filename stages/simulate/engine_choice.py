@@ -1,4 +1,4 @@
-"""The engine of `--engine auto` and its contacts: by how far weight and impacts deform the objects."""
+"""The choice of `--engine auto` and `--contact auto`, by how far weight, forces and impacts deform the objects."""
 
 from __future__ import annotations
 
@@ -20,27 +20,30 @@ from stages.simulate.options import AUTO, SimulateOptions
 from stages.simulate.setup import held_as_seen
 
 log = logging.getLogger(__name__)
-MAX_RIGID_SAG = 0.02  # largest compression by its own weight and what is above it of a body that counts as rigid
-MAX_SOLVED_SAG = 0.027  # the same of a body with solved contacts, whose dents then leave gaps of 5 % of its height
-MAX_RIGID_DROOP = 0.1  # largest `droop` of a body that counts as rigid
-MAX_RIGID_IMPACT = 0.1  # largest compression by an impact; that of which `plausibility.py` warns
+MAX_RIGID_SAG = 0.02  # largest compressive strain of a rigid body by its own weight and the load on it
+MAX_SOLVED_SAG = 0.027  # largest strain by own weight with solved contacts; dents then leave gaps of 5 % of height
+MAX_RIGID_DROOP = 0.1  # largest `droop` of a rigid body
+MAX_RIGID_IMPACT = 0.1  # largest compressive strain of a rigid body by an impact; `plausibility.py` warns above it
 NO_PROMPTS = ForcePrompts()
 
 
 def with_engine(
     options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts = NO_PROMPTS
 ) -> SimulateOptions:
-    """The options with an engine and contacts in place of `auto`.
+    """Replace `auto` in the options by an engine and a kind of contacts.
 
-    MPM if an object yields or flows, has parts of different materials, or is soft: compressed by more than
-    MAX_RIGID_SAG by its own weight and what is above it or by a force of the prompts, or by more than MAX_RIGID_IMPACT
-    by the speed that the prompts give it or what falls on it, or a sheet or rod off the floor that bends by more than
-    MAX_RIGID_DROOP. Else rigid bodies. Soft objects go to the learned field instead where MPM cannot follow, in live
-    sessions and with objects of photos that are held, unless the prompts move an object sideways or only an impact
-    deforms it, since its learned contacts have next to no friction and rebound. Options of learned engines (weights, an
-    integrator, its contacts) select it. Its contacts are learned if weight compresses an object by more than
-    MAX_SOLVED_SAG and the prompts move none sideways, with an integrator, since solved ones have no rate of change, or
-    with weights, which may be of a model without these contacts; else they are solved.
+    The engine is the learned one if weights, an integrator or contacts are given. Otherwise it is MPM if an object
+    yields or flows, has parts of different materials, or is soft, and rigid bodies if there is no such object. An
+    object is soft if its own weight and the load on it, or a force of the prompts, compress it by more than
+    MAX_RIGID_SAG; if an impact, at the speed that the prompts give it or of an object that falls on it, compresses it
+    by more than MAX_RIGID_IMPACT; or if it is a sheet or rod off the floor that bends by more than MAX_RIGID_DROOP.
+    The learned engine replaces MPM for soft objects where MPM is not suitable: in live sessions, and for objects of
+    photos that are held at rest. It does not if the prompts move an object sideways or only an impact deforms it, since
+    learned contacts have almost no friction and restitution.
+
+    Contacts of the learned engine are learned if weight compresses an object by more than MAX_SOLVED_SAG and the
+    prompts move no object sideways; with an integrator, since solved contacts have no rate of change; and with given
+    weights, which may be of a model without solved contacts. Otherwise they are solved.
     """
     engine = options.engine
     if engine == AUTO:
@@ -59,14 +62,14 @@ def with_engine(
 
 
 def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts) -> str:
-    """The engine in place of `auto`."""
+    """The engine for `--engine auto`, with a log message that gives the reason."""
     if options.weights is not None or options.integrator != "step" or options.contact != AUTO:
         return "ngff"
     materials = choose_materials(scene.objects, options.material, options.materials)
     uneven = [o for o in scene.objects if materials[o.id].several]
     plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
     blocks, held = _blocks(options, scene, keypoints, prompts), held_as_seen(scene, options)
-    # what photos show has been deformed by what is at rest on it
+    # objects of photos are already deformed by the objects that rest on them
     falling = [block for block in blocks if block.speed or not held]
     floor = _floor(options, scene, blocks)
     reasons = [reason for block in blocks if (reason := _deformed(block, falling, floor, options.gravity))]
@@ -87,17 +90,17 @@ def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
 
 
 class _Block(NamedTuple):
-    """An object as an upright box, once it is lifted, in metres and kilograms."""
+    """The axis-aligned bounding box of an object after its lift, with its material and what acts on it, in SI units."""
 
     id: int
     material: Material
-    guessed: bool  # whether the material is not known
-    low: Float[np.ndarray, "3"]
-    high: Float[np.ndarray, "3"]
-    extents: Float[np.ndarray, "3"]  # along its own principal axes, ascending
+    guessed: bool  # the material is not known
+    low: Float[np.ndarray, "3"]  # lower corner
+    high: Float[np.ndarray, "3"]  # upper corner
+    extents: Float[np.ndarray, "3"]  # along the principal axes of the object, ascending
     mass: float
-    speed: float  # at the start and after the fall of its lift [m/s]
-    force: float  # of the prompts, the largest [N]
+    speed: float  # initial speed, increased by the fall from the height of the lift [m/s]
+    force: float  # largest force of the prompts [N]
 
     @property
     def sides(self) -> Float[np.ndarray, "3"]:
@@ -105,17 +108,17 @@ class _Block(NamedTuple):
 
     @property
     def base(self) -> float:
-        """Area of its base [m^2]."""
+        """Area of the base [m^2]."""
         return float(max(self.sides[0] * self.sides[1], 1e-12))
 
     def is_above(self, other: _Block) -> bool:
-        """Whether it is above the middle of another one, so that it may fall or rest on it."""
+        """Whether it is over another block and above its middle, so that it may fall or rest on it."""
         beside = (self.low[:2] >= other.high[:2]).any() or (self.high[:2] <= other.low[:2]).any()
         return not beside and bool(self.low[2] >= (other.low[2] + other.high[2]) / 2)
 
 
 def _blocks(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts) -> list[_Block]:
-    """The objects that have keypoints; masses are those of the hulls of these."""
+    """Blocks of the objects that have keypoints; masses are those of the convex hulls of the keypoints."""
     materials = choose_materials(scene.objects, options.material, options.materials)
     unit, blocks = scene.metres_per_unit, []
     for o in scene.objects:
@@ -125,7 +128,7 @@ def _blocks(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
         _, axes = np.linalg.eigh(np.cov(x.T, bias=True))
         try:
             volume = float(ConvexHull(x).volume)
-        except (QhullError, ValueError):  # of what is flat
+        except (QhullError, ValueError):  # coplanar keypoints
             volume = 0.0
         lift = np.array([0.0, 0.0, unit * prompts.lift.get(o.id, 0.0)])
         choice = materials[o.id]
@@ -137,7 +140,7 @@ def _blocks(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
 
 
 def _floor(options: SimulateOptions, scene: Scene, blocks: Sequence[_Block]) -> float:
-    """Height of the floor [m]; that of the lowest object if the scene has none."""
+    """Height of the floor [m]; the lowest point of all objects if the scene has no floor."""
     floor = options.floor if options.floor is not None else scene.floor
     lowest = min((float(block.low[2]) for block in blocks), default=0.0)
     return lowest if floor is None else scene.metres_per_unit * floor
@@ -147,11 +150,11 @@ class _Reason(NamedTuple):
     """Why an object counts as soft."""
 
     text: str
-    impact: bool  # it is not deformed for long
+    impact: bool  # deformed only by an impact, not permanently
 
 
 def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: float) -> _Reason | None:
-    """What deforms an object so far that it does not count as rigid; `others` may press on it."""
+    """Why an object deforms too much to count as rigid; None if it is rigid. `others` may press on it or hit it."""
     m, height, g = block.material, float(block.sides[2]), abs(gravity)
     above = [other for other in others if other is not block and other.is_above(block)]
     load = g * sum(other.mass / min(other.base, block.base) for other in above)  # [Pa]
@@ -173,7 +176,7 @@ def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: fl
 
 
 def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) -> ForcePrompts:
-    """The prompts, with objects that have a pinned part pinned as a whole where the engine has no parts."""
+    """Adapt the prompts to the engine: those without parts pin an object as a whole if one of its parts is pinned."""
     if options.engine == "mpm":
         return prompts
     choices = choose_materials(scene.objects, options.material, options.materials)
@@ -189,25 +192,29 @@ def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) ->
 
 
 def sag(material: Material, height: float, gravity: float) -> float:
-    """Compression of a body of some height [m] under its own weight, about; gravity in m/s^2."""
+    """Approximate compressive strain of a body of this height [m] under its own weight; gravity in m/s^2."""
     return material.density * abs(gravity) * height / material.E
 
 
 def droop(material: Material, extents: Sequence[float], gravity: float) -> float:
-    """How far the end of a sheet or rod hangs down that lies over an edge with half of its length, relative to that.
+    """Tip deflection of a sheet or rod with half of its length overhanging an edge, relative to the overhang.
 
-    `extents` [m] ascending, of which the first is the thickness; by the theory of thin beams, gravity in m/s^2.
+    Euler-Bernoulli cantilever under its own weight. `extents` [m] are ascending, the first is the thickness; gravity in
+    m/s^2.
     """
     return 1.5 * material.density * abs(gravity) * (extents[2] / 2) ** 3 / (material.E * max(extents[0], 1e-12) ** 2)
 
 
 def impact(material: Material, speed: float) -> float:
-    """Compression of a body that hits a rigid one at some speed [m/s], about: that behind the elastic wave in a rod."""
+    """Approximate compressive strain of a body that hits a rigid one at this speed [m/s].
+
+    It is the strain behind the elastic wave in a rod, speed / sqrt(E / density).
+    """
     return speed * math.sqrt(material.density / material.E)
 
 
 def _speed(scene: Scene, object_id: int, prompts: ForcePrompts, options: SimulateOptions) -> float:
-    """Speed [m/s] of an object at the start and after the fall of its lift."""
+    """Initial speed of an object, increased by the fall from the height of its lift [m/s]."""
     unit = scene.metres_per_unit
     lift = unit * max(prompts.lift.get(object_id, 0.0), 0.0)
     thrown = unit * math.hypot(*prompts.velocity.get(object_id, (0.0,)))

@@ -1,4 +1,4 @@
-"""Surfaces of a scene's objects for the contacts of the learned field, in model units and the frames of its bodies."""
+"""Surfaces of the objects for the solved contacts of the learned engine, in model units and body frames."""
 
 from __future__ import annotations
 
@@ -23,22 +23,25 @@ from stages.core.scene.scene import Scene
 from stages.simulate.model_units import ModelUnits
 from stages.simulate.standing_surface import StandingSurface
 
-SAMPLES = 512  # points of a body that are looked up in others, about a twentieth of its size apart
-BALL_DIRECTIONS = 2000  # in which a ball is looked up in others at the start: to .001 radii
+SAMPLES = 512  # surface samples of a body that are looked up in other bodies, about a twentieth of its size apart
+BALL_DIRECTIONS = 2000  # surface samples of a ball for its initial overlaps, which are then accurate to .001 radii
 
 
 def body_surfaces(
     scene: Scene, initial: InitialConditions, units: ModelUnits, lift: Float[Tensor, "o 3"],
     floors: Float[Tensor, "o"], seed: int,
 ) -> BodySurfaces:  # fmt: skip
-    """The surfaces of all objects, each cut off at its floor [scene units], and their overlaps at the start."""
+    """Build the surfaces of all objects, each cut off below its floor [scene units], with their initial overlaps.
+
+    `lift` in scene units; `initial` has the keypoints in model units.
+    """
     com = centre_of_mass(initial, initial.points)
     arms = torch.where(initial.valid[..., None], initial.points - com[:, :, None], 0.0)[0]
     floor = float(floors.min())
     found, hulls = rigid_shapes(scene, seed, floor), convex_hulls(scene, seed, floor)
 
     def grid(row: int) -> BodyGrid:
-        start = units.to_model(lift[row]) - com[0, row]  # of the origin of the scene, in the body's frame
+        start = units.to_model(lift[row]) - com[0, row]  # origin of the scene, in the body's frame
         shape = StandingSurface(
             solid_surface(scene, scene.objects[row].id, seed).fitted, hulls[row], float(floors[row])
         )
@@ -60,14 +63,18 @@ def body_surfaces(
 def _grid(
     shape: StandingSurface, arm: Float[Tensor, "n 3"], start: Float[Tensor, "3"], length: float, seed: int
 ) -> BodyGrid:
-    """The grid of a body with keypoints at `arm` [m]; `start` is the origin of the scene in the body's frame [m]."""
+    """The signed distance grid and surface samples of a body.
+
+    `arm`: its keypoints relative to the centre of mass [m]; `start`: origin of the scene in the body's frame [m];
+    `length`: model metres per scene unit.
+    """
     depth, first = shape.depth_grid()
     low, h = start + length * torch.from_numpy(first).float(), length * shape.surface.h
     points, normals, at_edge = shape.points()
     flatness, faces = surface_faces(points, normals, at_edge)
     outer = extreme_rows(points)
     others = farthest_points(torch.from_numpy(points), SAMPLES - len(outer), seed).numpy()
-    row = np.union1d(outer, others)  # the outermost, and others far from each other
+    row = np.union1d(outer, others)  # extreme points, and others by farthest point sampling
     points = start.numpy() + length * points
     grid = length * depth, low.numpy(), h
     keypoint, nearest = nearest_points(arm.numpy(), *grid).clip(0), nearest_points(points, *grid)
@@ -83,7 +90,10 @@ def _grid(
 
 
 def _overlaps(surfaces: BodySurfaces, com: Float[Tensor, "o 3"]) -> Float[Tensor, "o o"]:
-    """How deep each body is in each other one [m]: of balls their surfaces, as in contacts, of others their samples."""
+    """Overlap [a, b]: depth of body a in body b [m], of the samples of a or, for a ball, of points on its surface.
+
+    The overlap of two balls is exact.
+    """
     centre, radius = com + surfaces.centre, surfaces.radius
     directions = torch.from_numpy(fibonacci(BALL_DIRECTIONS)).float()
     out = torch.zeros(len(com), len(com))

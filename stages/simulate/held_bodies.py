@@ -1,6 +1,6 @@
-"""Bodies of the learned field that are at rest in photos, held until their equilibrium is disturbed.
+"""Bodies of the learned engine that photos show at rest, held until their equilibrium is disturbed.
 
-As `resting_bodies.py` has it for MuJoCo's bodies, by the same forces and lengths.
+The conditions and limits are those of `resting_bodies.py`, which does the same for MuJoCo.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper
 from stages.simulate.resting_bodies import SUPPORT_COSINE, SUPPORT_GAP, Stance, excess_force, highest_below, leans
 
-RELEASE_FALL = 0.005  # bodies are released once they would have the speed after this fall [sizes of the smallest one]
+RELEASE_FALL = 0.005  # bodies are released at the speed after a fall of this height [size of the smallest body]
 
 
 class HeldBodies:
-    """Which of the `o` bodies of a scene are `asleep`, that is held; masks are on the CPU."""
+    """Tracks which of the `o` bodies of a scene are held (`asleep`); masks are on the CPU."""
 
     def __init__(
         self, initial: InitialConditions, surfaces: BodySurfaces, seen: Float[Tensor, "o 3"], awake: Bool[Tensor, "o"],
         standing: Bool[Tensor, "o"],
     ):  # fmt: skip
-        """`seen`: the centres of mass in the photos [m]; `standing` bodies stand on the floor there."""
+        """`seen`: centres of mass as reconstructed, without lifts [m]; `awake` bodies are not held; `standing` bodies
+        stand on the floor as reconstructed.
+        """
         self._stances = [
             _stance(surfaces, row, seen[row], float(initial.friction[0, row]), bool(standing[row]))
             for row in range(len(seen))
@@ -37,15 +39,15 @@ class HeldBodies:
         self.wake(awake)
 
     def wake(self, rows: Bool[Tensor, "o"]) -> None:
-        """Release these bodies, and those that rest on them."""
+        """Release these bodies and, recursively, those that rest on them."""
         while bool((more := (self._resting_on[:, rows].any(1) & ~rows)).any()):
             rows = rows | more
         self.asleep = self.asleep & ~rows
 
     def advance(self, stepper: TimeStepper, steps: int, pinned: Bool[Tensor, "o"]) -> None:
-        """Make the steps of a frame, with the bodies `pinned` or held not moving.
+        """Make the steps of one frame; `pinned` and held bodies do not move.
 
-        A step that disturbs held bodies is made again with these free.
+        A step that disturbs held bodies is repeated with these bodies released.
         """
         for _ in range(steps):
             while True:
@@ -61,7 +63,7 @@ class HeldBodies:
                 self.wake(woken)
 
     def _disturbed(self, load: Float[Tensor, "o 6"], initial: InitialConditions, dt: float) -> Bool[Tensor, "o"]:
-        """Bodies that the contact forces and torques `load` of the last dt [s] would have moved, if they were free."""
+        """Mask of the held bodies that the contact forces and torques `load` of the last step dt [s] disturb."""
         friction, height, half_width = (
             np.array([getattr(s, name) for s in self._stances]) for name in ("friction", "height", "half_width")
         )
@@ -82,8 +84,10 @@ def _stance(surfaces: BodySurfaces, row: int, com: Float[Tensor, "3"], friction:
 def _supports(
     surfaces: BodySurfaces, com: Float[Tensor, "o 3"], stances: list[Stance], gap: float
 ) -> Bool[Tensor, "o o"]:
-    """Whether each body rests on each other one: not on the floor but on its upper side, at most `gap` [m] away, or
-    leaning, on any side.
+    """Mask of the pairs (a, b) in which body a rests on body b.
+
+    Body a is at most `gap` [m] away from the upper side of b and not on the floor; or it leans and is near any side of
+    b; or it is above b without touching any body.
     """
     o, k, _ = surfaces.samples.shape
     at, real = com[:, None] + surfaces.samples, surfaces.near >= 0

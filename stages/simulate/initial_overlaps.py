@@ -1,27 +1,26 @@
-"""Overlaps of rigid bodies at the start, which are kept.
+"""Initial overlaps of rigid bodies, which are allowed so that they do not push bodies apart.
 
-Reconstructed objects overlap by the errors of their surfaces, which contacts would turn into speed. The overlap that
-two parts have at the start is therefore no contact: a contact begins where the overlap exceeds it. The overlap that is
-allowed follows the actual one down. So nothing is pushed apart, and what has left an overlap, by being lifted or by
-sliding, does not sink in again.
+Reconstructed objects overlap because of errors of their surfaces, which contact forces would turn into speed. The
+initial overlap of a pair is therefore subtracted from its penetration depths. The allowed overlap decreases with the
+actual one, so that bodies that have left an overlap, because they were lifted or slid, do not sink in again.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-WINDOW = 20  # substeps of which the deepest overlap is taken: the solver may miss a deep contact
+WINDOW = 20  # substeps over which the deepest overlap is taken, since the solver may miss a deep contact
 
 
 class AllowedOverlaps:
-    """The overlap allowed to each of some pairs: that of the start, later the deepest of some substeps if less."""
+    """The allowed overlap of each pair: the initial one, reduced to the deepest one of each WINDOW of substeps."""
 
     def __init__(self, at_start: np.ndarray):
         self.depth = at_start.copy()
         self._deepest, self._substeps = np.zeros_like(at_start), 0
 
     def note(self, pairs: tuple[np.ndarray, ...], depth: np.ndarray, free: np.ndarray) -> None:
-        """Take the overlaps of a substep, at indices `pairs`; those pairs that are not `free` keep theirs."""
+        """Record the overlaps `depth` of a substep at the indices `pairs`; pairs that are not `free` are unchanged."""
         np.maximum.at(self._deepest, pairs, depth)
         self._substeps += 1
         if self._substeps % WINDOW == 0:
@@ -30,10 +29,10 @@ class AllowedOverlaps:
 
 
 class InitialOverlaps:
-    """The overlap allowed to each pair of geometries that overlapped at the start [units of the simulation]."""
+    """The allowed overlaps of the pairs of geometries that overlap at the start [simulation units]."""
 
     def __init__(self, model, data):
-        """`data` has the contacts at the start."""
+        """`data` has the initial contacts."""
         deep = (data.contact.dist < 0) & (data.contact.exclude == 0)
         self._pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
         at_start = np.zeros(len(self._pairs))
@@ -45,9 +44,10 @@ class InitialOverlaps:
         self._bodies = model.geom_bodyid[self._pairs]
 
     def subtract(self, data, fixed: np.ndarray, count: int) -> None:
-        """Subtract the allowed overlaps from the first `count` contacts; `fixed` masks bodies that do not move.
+        """Subtract the allowed overlaps from the depths of the first `count` contacts.
 
-        Between mj_fwdPosition, which finds the contacts, and mj_fwdVelocity. Pairs of fixed bodies keep theirs.
+        To be called between mj_fwdPosition, which finds the contacts, and mj_fwdVelocity. `fixed` masks bodies that do
+        not move; the allowed overlaps of pairs of them do not change.
         """
         if not len(self._pairs):
             return

@@ -1,4 +1,7 @@
-"""The learned force field as an engine: scenes in the units of its training data, bodies with their solid inertia."""
+"""The learned engine: the force field advances the keypoints, in the units of its training data.
+
+Bodies have the mass and inertia of filled objects.
+"""
 
 from __future__ import annotations
 
@@ -46,22 +49,23 @@ from stages.simulate.sleep import SleepState
 from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
 log = logging.getLogger(__name__)
-# Limits of the training data, in metres and seconds of the model:
-SIZE_RANGE = (0.25, 1.2)  # shortest and longest of the longest sides of an object [m]
-MAX_OBJECTS = 6  # objects per scene of the benchmark
-MIN_THICKNESS = 0.044  # thickness of the thinnest object, the cloth [m]
-MAX_SPEED = 5.0  # maximum speed of falls [m/s]
-FAR_WALL = 100.0  # distance of walls where there are none [m]
-MAX_STEPS = 1000  # of the model for one frame
+# Limits of the training data, in model units:
+SIZE_RANGE = (0.25, 1.2)  # smallest and largest longest side of an object in training [m]
+MAX_OBJECTS = 6  # most objects in a scene of the benchmark
+MIN_THICKNESS = 0.044  # thickness of the thinnest object in training, the cloth [m]
+MAX_SPEED = 5.0  # highest speed of falls in training [m/s]
+
+FAR_WALL = 100.0  # distance of the walls of a scene without walls [m]
+MAX_STEPS = 1000  # largest number of model steps per frame
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
 
 
 @dataclass(frozen=True)
 class FieldObjects:
-    """The objects of a scene as the learned field takes them, before the conversion to model units."""
+    """The objects of a scene as input of the learned field, before the conversion to model units."""
 
     scene: Scene
-    keypoints: list[Float[Tensor, "k 3"]]  # of each object at rest [scene units]
+    keypoints: list[Float[Tensor, "k 3"]]  # keypoints of each object at rest [scene units]
     solids: list[SolidBody]
     setup: SceneSetup
     units: ModelUnits
@@ -76,7 +80,11 @@ class FieldObjects:
 def rollout(
     scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
-    """One state per frame, the first being the start. Raises InputError when the motion is no longer finite."""
+    """Yield one state per frame, the first of which is the initial state.
+
+    Raises InputError if the motion is no longer finite, for frames of more than MAX_STEPS model steps, and for weights
+    that have no solved contacts if these are asked for.
+    """
     device = pick_device(options.device)
     model, card = checkpoints.load(checkpoints.find(ENGINES[options.engine].weights, options.weights), device)
     if card.get("warning"):
@@ -112,7 +120,7 @@ def rollout(
              units.time, steps)  # fmt: skip
     awake = _starts_awake(initial, units, setup) | starts_released(scene, options)
     if options.contact == "solved":
-        awake |= not from_photos(scene)  # elsewhere nothing is missing that keeps them at rest
+        awake |= not from_photos(scene)  # scenes that are not from photos lack no supports
         seen = centre_of_mass(initial, initial.points)[0] - units.length * setup.lift
         rest = HeldBodies(initial, surfaces, seen, awake, setup.on_floor_as_seen)
     else:
@@ -157,7 +165,7 @@ def rollout(
 
 
 def _solids(scene: Scene, setup: SceneSetup, options: SimulateOptions, device: str) -> list[SolidBody]:
-    """The solid bodies of the objects: with solved contacts those of the surfaces that touch."""
+    """The mass properties of the objects; with solved contacts those of the shapes that collide."""
     if options.contact != "solved":
         return solid_bodies(scene, setup.bodies.spacing, device)
     shapes = standing_shapes(scene, options.seed, setup.box.low[2])
@@ -167,7 +175,7 @@ def _solids(scene: Scene, setup: SceneSetup, options: SimulateOptions, device: s
 def _field_start(
     keypoints: Keypoints, objects: FieldObjects, initial: InitialConditions, awake: Bool[Tensor, "o"], units: FieldUnits
 ) -> FieldStart:
-    """What the engine starts from, for the trajectory; values of keypoints in the order of `keypoints`."""
+    """The initial state for the trajectory file; values per keypoint are in the order of `keypoints`."""
     setup, ids = objects.setup, [o.id for o in objects.scene.objects]
 
     def of_keypoints(values: Tensor) -> Tensor:
@@ -185,7 +193,7 @@ def _field_start(
 
 
 def _initial_conditions(objects: FieldObjects, options: SimulateOptions) -> InitialConditions:
-    """Keypoints, materials and velocities of the objects at the start, in model units."""
+    """Initial keypoints, materials and velocities of the objects, in model units."""
     scene, setup, units = objects.scene, objects.setup, objects.units
     per_object, solids = objects.keypoints, objects.solids
     count, most = len(per_object), max(len(p) for p in per_object)
@@ -194,7 +202,7 @@ def _initial_conditions(objects: FieldObjects, options: SimulateOptions) -> Init
     fraction, inertia = torch.zeros(1, count, most), torch.zeros(1, count, 3, 3)
     velocity, floors = torch.zeros(1, count, 3), _floor_heights(per_object, setup, options)
     for row, (o, p) in enumerate(zip(scene.objects, per_object, strict=True)):
-        low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # points below the floor would be thrown up
+        low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # points below the floor would be ejected
         points[0, row, : len(p)] = units.to_model(p.maximum(low) + setup.lift[row])
         valid[0, row, : len(p)] = True
         choice = setup.materials[o.id]
@@ -230,10 +238,11 @@ def _floor_heights(
 ) -> Float[Tensor, "o"]:
     """Height of the floor under each object [scene units].
 
-    With solved contacts it is that of the scene, which cuts off what is below, except for objects that are mostly below
-    it. With learned ones standing objects keep their reconstructed height, since seats sag and undersides are not
-    visible: their floor is at their lowest keypoints, without outliers. On a common plane the lower objects would be
-    lifted into others. An object that stands on something else has the median floor of the standing ones.
+    With solved contacts it is the floor of the scene, below which objects are cut off; an object that is mostly below
+    the floor has its own lowest point instead. With learned contacts each standing object keeps its reconstructed
+    height, since seats sag and undersides are not visible: its floor is at its lowest keypoints, without outliers. A
+    common plane would lift low objects into others. An object that does not stand on the floor has the median floor of
+    the standing objects, or its own lowest keypoints if these are lower.
     """
     if options.contact == "solved":
         floor = setup.box.low[2]
@@ -245,7 +254,7 @@ def _floor_heights(
 
 
 def _model_stiffness(o: SceneObject, E: float, ratio: float) -> float:
-    """Young's modulus [Pa], at least that which makes the body as stiff as the softest in training."""
+    """Young's modulus [Pa], raised so that the body is at least as stiff as the softest bodies in training."""
     bounded = max(E, MIN_STIFFNESS / ratio)
     if bounded / 2 > E:
         log.warning("object %d (%s): %.2g Pa (at this size) is softer than bodies of its thickness in training; "
@@ -254,7 +263,7 @@ def _model_stiffness(o: SceneObject, E: float, ratio: float) -> float:
 
 
 def _starts_awake(initial: InitialConditions, units: ModelUnits, setup: SceneSetup) -> Bool[Tensor, "o"]:
-    """Objects with an initial velocity or lift; all objects where gravity does not hold them down."""
+    """Mask of the objects with an initial velocity or lift; all objects if gravity does not act downwards."""
     return (initial.velocity[0] != 0).any(-1) | (setup.lift != 0).any(-1) | (units.gravity <= 0)
 
 
@@ -264,18 +273,18 @@ def _rows(chosen: Collection[int], ids: list[int]) -> Bool[Tensor, "o"]:
 
 
 def _pushed(forces: Sequence[Force], ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
-    """Objects on which a force acts at some time from `start` to `end` [s]."""
+    """Mask of the objects on which a force acts at some time from `start` to `end` [s]."""
     return _rows({f.object_id for f in forces if f.active_fraction(start, end) > 0}, ids)
 
 
 def _woken(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
-    """Objects woken by changes: all by another gravity, else those that are released or get another material."""
+    """Mask of the objects that changes wake: all by a change of gravity, else the objects of the changes."""
     whole = any(c.what == "gravity" for c in changes)
     return _rows(ids if whole else {c.object_id for c in changes}, ids)
 
 
 def _changed(objects: FieldObjects, options: SimulateOptions) -> InitialConditions:
-    """`_initial_conditions` with other materials, friction and gravity in the same units."""
+    """`_initial_conditions` with the materials, friction and gravity of these options, in unchanged units."""
     setup, units = objects.setup, objects.units
     setup = replace(setup, materials=choose_for_bodies(objects.scene, setup.bodies, options))
     gravity = options.gravity * units.length / objects.scene.metres_per_unit / units.time**2
@@ -283,7 +292,7 @@ def _changed(objects: FieldObjects, options: SimulateOptions) -> InitialConditio
 
 
 def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequence[Force], ids: list[int]) -> None:
-    """Write these forces to the slots of `slots`, of which the rest has no effect; there must be enough."""
+    """Overwrite `slots` with these forces, in place. There must be enough slots; unused ones have no effect."""
     rest = [Force(ids[0], start=0.0, end=0.0)] * (slots.object.shape[1] - len(forces))
     new = ExternalForces.from_prompts(initial, ForcePrompts((*forces, *rest)), ids)
     for name in ("object", "force", "torque", "start", "end", "point"):
@@ -291,7 +300,7 @@ def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequ
 
 
 def _warn_extrapolation(initial: InitialConditions, model: Dynamics) -> None:
-    """Warn of conditions outside the training data and of quantities that the model does not take as inputs."""
+    """Warn of conditions outside the training data, and of quantities that the model does not take into account."""
     points = initial.points[0]
     hidden = ~initial.valid[0, ..., None]
     long = (points.masked_fill(hidden, -torch.inf).amax(1) - points.masked_fill(hidden, torch.inf).amin(1)).amax(1)
@@ -315,12 +324,12 @@ def _state(
     keypoints: Keypoints, ids: list[int], start: tuple[Int[Tensor, "p"], Float[Tensor, "p 3"]],
     initial: InitialConditions, moved: Float[Tensor, "1 o n 3"],
 ) -> FrameState:  # fmt: skip
-    """Keypoints displaced by `moved` [scene units], and the centres of their masses.
+    """The state with keypoints displaced by `moved` [scene units], and the centres of mass of the objects.
 
-    start: the row of the object of each keypoint, and its position once lifted.
+    start: row of each keypoint's object, and each keypoint's position after the lift [scene units].
     """
     row, lifted = start
-    order = row.argsort(stable=True)  # the keypoints of the objects one after the other, as in `initial`
+    order = row.argsort(stable=True)  # keypoints sorted by object, as in `initial`
     valid = initial.valid[0]
     positions = lifted.index_add(0, order, moved[0][valid])
     weighted = initial.mass_fraction[0][valid][:, None] * positions[order]

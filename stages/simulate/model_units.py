@@ -1,9 +1,10 @@
-"""Units of the learned model: every scene is brought to the size, mass and gravity of the training data.
+"""Units of the learned model: every scene is scaled to the size, mass and gravity of the training data.
 
-Motion under gravity is the same at any size when times scale with the square root of length over gravity, and for any
-unit of mass when stresses and forces scale with it. Lengths, times and masses are therefore in units of the scene
-itself, so that neither its size nor a common factor of masses and Young's moduli changes the motion. With lengths L,
-masses M and times T = sqrt(L g / g') of the model per SI unit: stresses M / (L T^2), forces M L / T^2.
+Motion under gravity is invariant to size if times scale with the square root of length over gravity, and to the unit of
+mass if stresses and forces scale with it (dynamic similarity). So neither the size of a scene nor a common factor of
+its masses and Young's moduli changes the motion. With L model metres per metre, M model kilograms per kilogram, and
+T = sqrt(L g / g') model seconds per second, stresses scale by M / (L T^2) and forces by M L / T^2; g is the gravity of
+the scene and g' that of the model.
 """
 
 from __future__ import annotations
@@ -21,31 +22,31 @@ from stages.core.models.initial_conditions import FLOOR
 from stages.core.physics.forces import Force
 from stages.core.scene.field_start import UnitFactors
 
-TYPICAL_SIZE = 0.55  # median longest side of an object of the training data [m]
-TYPICAL_MASS = 8.0  # geometric mean of their masses, all published objects hollow [kg]
-TRAINING_GRAVITY = 5.0  # [m/s^2]
+TYPICAL_SIZE = 0.55  # median longest side of the objects of the training data [m]
+TYPICAL_MASS = 8.0  # geometric mean of the masses of these objects; the published ones are all hollow [kg]
+TRAINING_GRAVITY = 5.0  # gravity of the training data [m/s^2]
 
 
 @dataclass(frozen=True)
 class ModelUnits(UnitFactors):
-    """Units of the model, its origin and its gravity."""
+    """Unit factors of the model, its origin and its gravity."""
 
-    origin: Float[Tensor, "3"]  # scene point that becomes (0, 0, FLOOR) [scene units]
-    gravity: float  # downwards, in model units [m/s^2]
+    origin: Float[Tensor, "3"]  # scene point that is mapped to (0, 0, FLOOR) [scene units]
+    gravity: float  # downward gravity in model units [m/s^2]
 
     @staticmethod
     def for_objects(
         keypoints: list[Float[Tensor, "k 3"]], masses: Float[Tensor, "o"], floor: float, unit: float, gravity: float
     ) -> ModelUnits:
-        """Units in which objects have typical sizes and masses (as geometric means) and gravity is that of training.
+        """Choose units in which the geometric means of sizes and masses, and gravity, are those of the training data.
 
-        `keypoints` of each object and `floor` are in scene units of `unit` metres, `masses` in kg; `gravity` is
-        downwards [m/s^2].
+        `keypoints` of each object and the height `floor` are in scene units of `unit` metres, `masses` in kg;
+        `gravity` is downwards [m/s^2].
         """
         sides = torch.tensor([longest_side(p) for p in keypoints]).clamp_min(1e-9)
         scale = TYPICAL_SIZE / (unit * float(sides.double().log().mean().exp()))
         model_gravity = math.copysign(TRAINING_GRAVITY, gravity) if abs(gravity) > 1e-3 else 0.0
-        gravity_ratio = model_gravity / gravity if model_gravity else 1.0  # without gravity, time is not scaled for it
+        gravity_ratio = model_gravity / gravity if model_gravity else 1.0  # does not apply without gravity
         middle = torch.cat(keypoints).mean(0)
         origin = torch.tensor([float(middle[0]), float(middle[1]), floor])
         mass = TYPICAL_MASS / float(masses.double().clamp_min(1e-30).log().mean().exp())
@@ -62,11 +63,11 @@ class ModelUnits(UnitFactors):
         return self.force / self.scale**2
 
     def to_model(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points in scene units to model metres."""
+        """Convert points from scene units to model metres."""
         return (points - self.origin) * self.length + torch.tensor([0.0, 0.0, FLOOR])
 
     def forces(self, forces: Sequence[Force], lift: Float[Tensor, "o 3"], ids: list[int]) -> tuple[Force, ...]:
-        """Forces in model units; points of application move with the `lift` of their object [scene units]."""
+        """Convert forces to model units; points of application move with the `lift` of their object [scene units]."""
 
         def scaled(f: Force) -> Force:
             at = None

@@ -1,7 +1,7 @@
-"""An MPM grid that follows the particles: there is a floor, but no walls and no ceiling.
+"""An MPM grid that follows the particles, so that there is a floor but no walls and no ceiling.
 
-Before a frame in which a particle could come near a face of the grid, the solver is built again on a grid around the
-particles, with its nodes on the same lattice, so that nothing else changes.
+Before a frame in which a particle could come near a face of the grid, the solver is rebuilt on a grid around the
+particles. The nodes of both grids are on the same lattice, so that the result does not change.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from stages.core.physics.mpm.body_shapes import BodyShape
 from stages.core.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
-MARGIN = 6  # nodes between the particles and the faces of the grid: stencils, and the elastic rebound of what was hit
-MAX_SUBSTEPS = 200_000  # of a frame: minutes, where hundreds are usual
-FRAMES = 10  # frames for which a new grid has room at the present speed
+MARGIN = 6  # nodes between the particles and the faces of the grid, for stencils and the elastic rebound after impacts
+MAX_SUBSTEPS = 200_000  # substeps per frame, which take minutes; hundreds are usual
+FRAMES = 10  # number of frames for which a new grid has room at the present speed
 
 
 @dataclass(frozen=True)
 class GridBodies:
     """The bodies on a grid, each with its own velocity field."""
 
-    body: Int[Tensor, "p"]  # row of each particle's object in `objects`; particles are in the order of their bodies
+    body: Int[Tensor, "p"]  # row of each particle's object in `objects`, ascending
     objects: Sequence[SceneObject]
-    shapes: Sequence[BodyShape] | None = None  # by default of voxels, see SolverOptions
+    shapes: Sequence[BodyShape] | None = None  # by default made of voxels, see SolverOptions
 
 
 class MovingGrid:
-    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`.
+    """An MPM solver whose grid follows its particles.
 
-    Raises InputError for a grid that is too large.
+    `box` is the initial domain [m]; a `fixed` domain never moves. `dx` is the grid spacing [m]. Raises InputError for a
+    grid that is too large.
     """
 
     def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, bodies: GridBodies, fixed: bool):
@@ -57,15 +58,15 @@ class MovingGrid:
             raise InputError(f"--engine mpm: {error}; {remedy}, use a coarser --quality or another --engine") from error
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
-        """Advance by `duration` [s] under these accelerations [m/s^2], on a new grid where the old one is too small.
+        """Advance by `duration` [s] with these accelerations [m/s^2], on a new grid if the present one is too small.
 
-        Raises InputError as `substeps` does, and mpm.Diverged.
+        Raises InputError for more than MAX_SUBSTEPS, and mpm.Diverged.
         """
         self._make_room(duration, acceleration)
         self.solver.advance(duration, acceleration, self.substeps(duration, acceleration))
 
     def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
-        """Number of substeps in `duration` [s]; InputError for more than MAX_SUBSTEPS, which would take minutes."""
+        """Number of substeps in `duration` [s]. Raises InputError for more than MAX_SUBSTEPS."""
         count = self.solver.substeps(duration, acceleration)
         if count > MAX_SUBSTEPS:
             raise InputError(
@@ -76,11 +77,14 @@ class MovingGrid:
         return count
 
     def _speed(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> float:
-        """Bound of the speed of particles at the end of `duration` [m/s]."""
+        """Estimate of the highest particle speed at the end of `duration`, without elastic forces [m/s]."""
         return float(self.solver.rows["v"].norm(dim=1).max()) + duration * float(acceleration.norm(dim=1).max())
 
     def _make_room(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
-        """Move the grid if a particle could come near one of its faces, except the floor, within a frame."""
+        """Move the grid if a particle could come near one of its faces other than the floor within `duration` [s].
+
+        If the grid would be too large, it stays where it is from then on, and a warning says so.
+        """
         x, speed, dx = self.solver.rows["x"], self._speed(duration, acceleration), self._dx
         if not math.isfinite(speed) or self._fixed:
             return
@@ -101,7 +105,7 @@ class MovingGrid:
         self.solver = self._build(self.solver.particles, box)
 
     def _around(self, low: Sequence[float], high: Sequence[float], room: float) -> mpm.Box:
-        """A box that leaves `room` [m] around the particles, its lower corner on the lattice of the present one."""
+        """A box with `room` [m] around the bounds of the particles; its lower corner is on the present lattice."""
         step = BLOCK * self._dx
         corner = [b + step * math.floor((a - room - b) / step) for a, b in zip(low[:2], self.box.low[:2], strict=True)]
         return replace(self.box, low=(*corner, self.box.low[2]), high=tuple(a + room for a in high))
@@ -110,7 +114,7 @@ class MovingGrid:
         return self._copies * math.prod((b - a) / self._dx + 16 for a, b in zip(box.low, box.high, strict=True))
 
     def _farthest(self) -> str:
-        """The object whose middle is farthest from the median of all."""
+        """The object whose mean position is farthest from the median of those of all objects, for a message."""
         x = self.solver.particles.x.cpu()
         body, objects = self._bodies.body, self._bodies.objects
         middles = torch.stack([x[body == row].mean(0) for row in range(len(objects))])

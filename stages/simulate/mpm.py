@@ -1,6 +1,6 @@
-"""The MPM engine: Gaussians to particles, particles through time, their motion to the keypoints.
+"""The MPM engine: samples particles in the objects, simulates them and transfers their motion to the keypoints.
 
-The solver works in metres and kilograms; input and output are in scene units.
+The solver works in SI units; input and output are in scene units.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from stages.simulate.setup import SceneSetup, choose_for_bodies, held_as_seen, s
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
-GPU_STEP = 8e-4  # shortest substep worth taking on a GPU, as MpmQuality.step
-CFL_MARGIN = 0.85  # fraction of the stability limit that materials may use up
+GPU_STEP = 8e-4  # shortest substep on a GPU, in the units of MpmQuality.step
+CFL_MARGIN = 0.85  # fraction of the stability limit up to which materials may be stiff or viscous
 
 
 def rollout(
     scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
-    """One state per frame, the first being the start.
+    """Yield one state per frame, the first of which is the initial state.
 
     Each body has a velocity field of its own. On a GPU the quality levels above draft use twice the resolution and
-    stiffer materials. Raises InputError when a body leaves the domain or its motion is no longer finite.
+    stiffer materials. Raises InputError if a body leaves the domain or its motion is no longer finite.
     """
     unit, device = scene.metres_per_unit, pick_device(options.device)
     level, fine = options.level, device != "cpu" and options.quality != "draft"
@@ -99,12 +99,12 @@ def rollout(
 
 
 def _shape(scene: Scene, object_id: int, x: Float[Tensor, "p 3"], h: float, seed: int) -> BodyShape:
-    """The undeformed shape of an object with particles at x and the spacing h, in scene units."""
+    """The undeformed shape of an object with particles at `x` and the particle spacing `h`, in scene units."""
     return shape_of_voxels(x.double().numpy(), h, solid_surface(scene, object_id, seed))
 
 
 def _gravity(particles: mpm.Particles, options: SimulateOptions) -> Float[Tensor, "p 3"]:
-    """Acceleration of the particles that are not held [m/s^2]."""
+    """Gravitational acceleration of each particle [m/s^2]; 0 for held particles."""
     gravity = torch.tensor([0.0, 0.0, -options.gravity]).repeat(len(particles), 1)
     gravity[particles.held > 0] = 0
     return gravity
@@ -113,7 +113,7 @@ def _gravity(particles: mpm.Particles, options: SimulateOptions) -> Float[Tensor
 def _changed(
     scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions, level: MpmQuality
 ) -> mpm.Particles:
-    """`_particles` with other materials, friction and pins. Raises InputError for another material model."""
+    """`_particles` with changed materials, friction and pins. Raises InputError if a material model would change."""
     materials = choose_for_bodies(scene, setup.bodies, options)
     for o in scene.objects:
         models = [{part.material.model for part in m[o.id].parts} for m in (materials, setup.materials)]
@@ -124,7 +124,7 @@ def _changed(
 
 
 def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) -> None:
-    """Give the particles the material and the pins of `new`; those that are pinned now stop."""
+    """Set the materials and pins of the particles to those of `new`; newly pinned particles stop."""
     stopped = (new.held > 0) & (particles.held == 0)
     now = solver.particles
     changed = {name: getattr(new, name) for name in
@@ -148,11 +148,11 @@ def _divergence(o: SceneObject, time: float) -> InputError:
 def _particles(
     scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions, level: MpmQuality
 ) -> mpm.Particles:
-    """Particles in metres with each object's material, softened where the quality's substep demands it."""
+    """Particles of all objects in SI units, with materials that are softened if the substep of `level` requires it."""
     unit, body, x = scene.metres_per_unit, setup.bodies.body, setup.bodies.x
     h, volume = setup.bodies.spacing * unit, setup.bodies.volume * unit**3
-    columns = torch.zeros(len(body), 9)  # E density nu viscosity friction model, and its three parameters
-    branches = torch.zeros(len(body), 4)  # moduli and rates
+    columns = torch.zeros(len(body), 9)  # E, density, nu, viscosity, friction, model, and three parameters of the model
+    branches = torch.zeros(len(body), 4)  # moduli and relaxation rates of the two Maxwell branches
     velocity, held = torch.zeros(len(body), 3), torch.zeros(len(body), dtype=torch.int8)
     for row, o in enumerate(scene.objects):
         choice, mine = setup.materials[o.id], (body == row).nonzero()[:, 0]
@@ -190,22 +190,22 @@ def _particles(
 
 
 class _StableMaterial(NamedTuple):
-    """What the solver takes for a material."""
+    """Material parameters with which the solver is stable."""
 
     E: float  # [Pa]
-    loss: float  # factor tan(delta)
+    loss: float  # loss factor tan(delta)
     viscosity: float  # [Pa s]
-    branch_modulus: tuple[float, float]  # over E
-    branch_rate: tuple[float, float]  # [1/s]
+    branch_modulus: tuple[float, float]  # moduli of the Maxwell branches, relative to E
+    branch_rate: tuple[float, float]  # relaxation rates of the Maxwell branches [1/s]
 
 
 def _stable_material(m: Material, length: float, h: float, level: MpmQuality) -> _StableMaterial:
     """The material of a body of this `length` [m], as stiff as the substep allows; `h` is the particle spacing [m].
 
-    Elastic materials have their loss factor from the slowest longitudinal vibration of a bar of this length, omega =
-    pi c / L, down to a tenth of that frequency, by Maxwell branches; impacts are a few times slower than the vibration.
-    The substep is shorter by what the branches add to the stiffness. Materials that flow have the viscosity
-    E loss / omega of a Kelvin-Voigt solid, as far as the substep allows.
+    Maxwell branches give elastic materials their loss factor from the lowest longitudinal vibration of a bar of this
+    length, omega = pi c / L, down to a tenth of that frequency, since impacts are a few times slower than this
+    vibration. The stiffness of the branches shortens the substep. Materials that flow have the viscosity E loss / omega
+    of a Kelvin-Voigt solid, reduced if the substep requires it.
     """
     substep = level.substep(h)
     fastest = CFL_MARGIN * mpm.SAFETY * 2 * h / substep
@@ -220,7 +220,7 @@ def _stable_material(m: Material, length: float, h: float, level: MpmQuality) ->
 
 
 class _PromptedForce:
-    """A force prompt as accelerations of the particles of its object."""
+    """A force prompt, distributed over the particles of its object that are not held."""
 
     def __init__(self, force: Force, particles: mpm.Particles, setup: SceneSetup, row: int):
         self.force, self.mass = force, particles.mass
@@ -229,12 +229,12 @@ class _PromptedForce:
         if force.at is not None:
             distance = (setup.bodies.x - torch.tensor(force.at)).norm(dim=1)
             nearest = distance[self.mine > 0].min() if bool(self.mine.any()) else distance.min()
-            radius = 4 * setup.bodies.spacing  # two grid cells, around the particle nearest to the point
+            radius = 4 * setup.bodies.spacing  # two grid cells, in addition to the nearest distance
             weight *= torch.exp(-(((distance - nearest) / radius) ** 2) / 2) * (distance - nearest < 2 * radius)
-        self.weight = weight / (weight * self.mass).sum().clamp_min(1e-30)  # sum of mass x weight is 1
+        self.weight = weight / (weight * self.mass).sum().clamp_min(1e-30)  # [1/kg]; the sum of mass * weight is 1
 
     def acceleration(self, x: Float[Tensor, "p 3"], start: float, end: float) -> Float[Tensor, "p 3"]:
-        """Mean acceleration [m/s^2] of particles at `x` [m] over the time from `start` to `end` [s]."""
+        """Accelerations [m/s^2] of particles at `x` [m], averaged over the time from `start` to `end` [s]."""
         active = self.force.active_fraction(start, end)
         if not active:
             return torch.zeros_like(x)
@@ -249,11 +249,11 @@ class _PromptedForce:
 
 
 class _Attachment(NamedTuple):
-    """Keypoints, each with the particles of its object that it follows."""
+    """Keypoints, and the particles that each keypoint follows."""
 
     keypoints: Keypoints
     index: Int[Tensor, "k j"]  # rows of the particles
-    weight: Float[Tensor, "k j"]  # rows sum to 1
+    weight: Float[Tensor, "k j"]  # weights of the particles; each row sums to 1
 
 
 def _attach(scene: Scene, keypoints: Keypoints, bodies: Bodies) -> _Attachment:
@@ -272,9 +272,9 @@ def _state(
     scene: Scene, setup: SceneSetup, attachment: _Attachment, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"],
     mass: Float[Tensor, "p"],
 ) -> FrameState:  # fmt: skip
-    """Keypoints moved and deformed with the particles that they follow; at the start they are moved by the lift alone.
+    """The state with keypoints moved and deformed with their particles; in the first frame only the lift moves them.
 
-    `x` in scene units, `mass` [kg].
+    Positions `x` of the particles in scene units, deformation gradients `F`, `mass` in kg.
     """
     keypoints, index, weight = attachment
     bodies = setup.bodies

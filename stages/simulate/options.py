@@ -12,15 +12,15 @@ from stages.core.options import device_option, option, seed_option
 
 @dataclass(frozen=True)
 class Engine:
-    """A simulation engine: its properties for the command line, `ngff-lab doctor` and error messages."""
+    """A simulation engine, as described on the command line, by `ngff-lab doctor` and in error messages."""
 
     rollout: str  # "module:function"; (scene, keypoints, prompts, options) -> an iterator of FrameState
-    help: str
+    help: str  # one line for the help of --engine
     weights: str | None = None  # model whose weights it needs (see stages/core/models/checkpoints.py)
 
 
-MAX_FRAMES = 10**9  # as many as --live asks for
-MAX_HEIGHT = 1e9  # of the floor [scene units], as in files
+MAX_FRAMES = 10**9  # number of frames that --live asks for
+MAX_HEIGHT = 1e9  # largest absolute height of the floor, as in files [scene units]
 AUTO = "auto"  # see engine_choice.py
 STANDARD_GRAVITY = 9.81  # [m/s^2]
 ENGINES = {
@@ -28,9 +28,9 @@ ENGINES = {
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
     "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies by MuJoCo, for stiff ones"),
 }
-DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with the latter two CPU cores keep up with real time
+DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with LIVE_KEYPOINTS two CPU cores keep up with real time
 CONTACTS = (AUTO, "learned", "solved")
-# The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).
+# The model's own time step, or an ODE solver of torchdiffeq (see stages/core/models/integrate.py).
 INTEGRATORS = ("step", "euler", "rk4", "dopri5")
 ENGINE_HELP = " | ".join(["auto: by the materials of the objects", *(f"{k}: {v.help}" for k, v in ENGINES.items())])
 
@@ -39,14 +39,14 @@ ENGINE_HELP = " | ".join(["auto: by the materials of the objects", *(f"{k}: {v.h
 class MpmQuality:
     """Resolution of the MPM engine."""
 
-    particles: int  # of all objects together; the grid spacing follows from eight particles in a full cell
-    step: float  # shortest substep taken [sqrt(particle spacing / g)]; materials too stiff for it are softened
+    particles: int  # particles of all objects; the grid spacing follows from eight particles in a full cell
+    step: float  # shortest substep [sqrt(particle spacing / g)]; materials too stiff for it are softened
 
     def substep(self, spacing: float) -> float:
         """Shortest substep [s] for a particle `spacing` [m].
 
-        In proportion to the time in which a body falls by the spacing, so that a scene of another size is softened
-        alike: E / (density g size) is the same.
+        It is proportional to the time in which a body falls by the spacing, so that scenes of all sizes are softened
+        equally: E / (density g size) is the same.
         """
         return self.step * math.sqrt(spacing / STANDARD_GRAVITY)
 
@@ -145,5 +145,5 @@ class SimulateOptions:
 
     @property
     def level(self) -> MpmQuality:
-        """Resolution that `quality` stands for."""
+        """The resolution of `quality`."""
         return QUALITIES[self.quality]

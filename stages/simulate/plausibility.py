@@ -1,16 +1,16 @@
-"""Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
+"""Measures of implausible motion, updated in every frame: penetration, creep, spread and energy gain.
 
 penetration: depth of the deepest keypoint of an object in another object or below the floor, relative to the smaller
-height of the two. With an engine whose table has edges: in the table, from its top or its sides. The depth in the
-scene at rest is subtracted, and so is one that --lift causes, which has a warning of its own. The distance of a
-keypoint from the mean surface of its own object (noise, floaters) is subtracted too, and in other objects its depth
-below the floor at rest, where bodies are cut off. In a deformed object it is measured where the material was at rest,
-since a dent under a load is no penetration.
-creep: speed of an object in the last quarter of the time, if it is slow in all of that quarter [its size / s].
-spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
-energy_gain: largest increase of the mechanical energy of all objects above that at the start, or after the last force,
-relative to the energy that was converted: what was lost, or the kinetic energy, if that is more, since in free fall or
-free space next to nothing is lost. The inertia is that of the filled bodies, since keypoints are on surfaces.
+height of the two; with an engine whose table has edges, depth in the table from its top or its sides. Subtracted are:
+the depth in the scene at rest; a depth that --lift causes, which has a warning of its own; the distance of a keypoint
+from the mean surface of its own object (noise, floaters); and, in other objects, its depth below the floor at rest,
+where bodies are cut off. In a deformed object depth is measured in material coordinates, since a dent under a load is
+not a penetration.
+creep: magnitude of the mean velocity in the last quarter of the time, if the object is slow throughout [its size / s].
+spread: largest relative change of the root mean square distance of an object's keypoints from their mean.
+energy_gain: largest increase of the mechanical energy of all objects above its value at the start, or after the last
+force, relative to the converted energy. This is the larger of the energy loss and the kinetic energy, since almost no
+energy is lost in free fall or free space. The inertia is that of the filled bodies, since keypoints are on surfaces.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.setup import table_of
 
 log = logging.getLogger(__name__)
-BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a warning is logged
-MAX_CHECKED_KEYPOINTS = 256  # keypoints of an object whose depth is measured
-SLOW = 0.1  # largest speed of an object that creeps, relative to that of a fall by half the object's size
-MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured, or least deformation [size]
-NEIGHBOURS = 4  # keypoints whose displacement a point in a deformed object has
+BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # a warning is logged above these
+MAX_CHECKED_KEYPOINTS = 256  # largest number of keypoints per object whose depth is measured
+SLOW = 0.1  # largest speed of a creeping object, relative to its speed after a fall by half its size
+MOVED = 1e-3  # displacements and deformations below this are ignored [size of the object]
+NEIGHBOURS = 4  # number of nearest keypoints from which the displacement of a point is interpolated
 
 
 class PlausibilityMonitor:
-    """Takes the frames of a run one by one; rows of objects follow scene.objects. Lengths in scene units."""
+    """Measures the frames of a run one by one; rows of objects follow scene.objects. Lengths are in scene units."""
 
     def __init__(self, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions):
         self._scene, self._prompts, self._options = scene, prompts, options
@@ -54,21 +54,21 @@ class PlausibilityMonitor:
         self._radius = [max(_radius(r), 1e-12) if len(r) else 1.0 for r in self._rest]
         self._floor = options.floor if options.floor is not None else scene.floor
         self._table = table_of(scene, options) if options.engine == "rigid" else None
-        self._left = np.zeros(len(scene.objects), bool)  # the table, over its edge
+        self._left = np.zeros(len(scene.objects), bool)  # mask of the objects that have fallen off the table
         self._surface, self._outside = cache(self._surface_of), cache(self._outside_of)
         self._height = cache(self._height_of)
         self._at_rest = cache(self._rest_depth)
         count = len(scene.objects)
         self.penetration, self._partner = np.zeros(count), [""] * count
-        self._put_into: dict[tuple[int, int], float] = {}  # depth in the first frame, of rows
+        self._put_into: dict[tuple[int, int], float] = {}  # pair of rows -> depth in the first frame
         self._spread = np.zeros(count)
-        self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # of the last quarter
-        self._energy: list[tuple[float, float]] = []  # kinetic and potential
+        self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # last quarter of the run
+        self._energy: list[tuple[float, float]] = []  # kinetic and potential energy
         self._second_moment = cache(self._second_moment_of)
         self._before: tuple[list[np.ndarray], np.ndarray, np.ndarray] | None = None
 
     def add(self, state: FrameState) -> None:
-        """The next frame."""
+        """Measure the next frame."""
         x = state.positions.double().cpu().numpy()
         points = [x[rows.numpy()] for rows in self._rows]
         com, R = state.com.double().cpu().numpy(), matrix(state.rotation.double().cpu()).numpy()
@@ -104,7 +104,7 @@ class PlausibilityMonitor:
                 local = (points[a][self._few[a]] - com[b]) @ R[b] + self._origin[b]
                 local = self._undeformed(b, local, (points[b] - com[b]) @ R[b] + self._origin[b])
                 depth = float(self._depth(a, b, local).max())
-                if self._frames == 1:  # where the prompts put it
+                if self._frames == 1:  # initial penetration, which the prompts cause
                     self._put_into[a, b] = depth
                 depth -= max(self._at_rest(a, b), self._put_into.get((a, b), 0.0))
                 smaller = min(self._height(a), self._height(b))
@@ -113,7 +113,7 @@ class PlausibilityMonitor:
                     self._record(i, depth, smaller, f"object {o.id} ({o.name})")
 
     def _undeformed(self, row: int, x: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-        """Where points (k, 3) near an object's `keypoints` would be at rest if they moved with the nearest of these."""
+        """Rest positions of points (k, 3) in a deformed object, by interpolation between its nearest `keypoints`."""
         shift = self._rest[row] - keypoints
         if np.abs(shift).max() < MOVED * self._size[row]:
             return x
@@ -130,14 +130,14 @@ class PlausibilityMonitor:
         return max(0.0, float(self._depth(a, b, self._rest[a][self._few[a]]).max()))
 
     def _depth(self, a: int, b: int, x: np.ndarray) -> np.ndarray:
-        """Depths of some of the keypoints of object a, at x (k, 3) in the rest frame of object b, in that one."""
+        """Depths in object b of the checked keypoints of object a, at `x` (k, 3) in the rest frame of b."""
         few = self._few[a]
         outside = self._outside(a)[few] if self._floor is None else np.maximum(
             self._outside(a)[few], self._floor - self._rest[a][few, 2])  # fmt: skip
         return self._body_depth(b, x) - outside
 
     def _body_depth(self, row: int, x: np.ndarray) -> np.ndarray:
-        """Depths of points (k, 3) in the body of an object at rest, which ends at the floor."""
+        """Depths of points (k, 3) in the body of an object at rest, cut off at the floor; negative outside."""
         depth = self._surface(row).depth(x)
         return depth if self._floor is None else np.minimum(depth, x[:, 2] - self._floor)
 
@@ -145,21 +145,23 @@ class PlausibilityMonitor:
         return solid_surface(self._scene, self._scene.objects[row].id, self._options.seed)
 
     def _height_of(self, row: int) -> float:
-        """Of an object at rest; at least a voxel of its body, since that of a flat sheet may be 0."""
+        """Height of an object at rest; at least one voxel, since the height of a flat sheet may be 0."""
         return max(float(np.ptp(self._rest[row][:, 2])), self._surface(row).h)
 
     def _outside_of(self, row: int) -> np.ndarray:
-        """How far the keypoints (k,) of an object are outside its own body."""
+        """Distances (k,) of the keypoints of an object from its own body; 0 for those inside."""
         return np.maximum(-self._surface(row).depth(self._rest[row]), 0)
 
     def _second_moment_of(self, row: int) -> np.ndarray:
-        """Mean of x x^T (3, 3) over an object's filled body, about its centre at rest."""
+        """Second moment of an object's filled body at rest: mean of x x^T (3, 3) about its centre."""
         body = self._surface(row)
         return np.cov(body.voxels.T, bias=True) + body.h**2 / 12 * np.eye(3)
 
     def _mechanical_energy(self, now: tuple, before: tuple, mass: np.ndarray) -> tuple[float, float]:
-        """Kinetic and potential energy per unit of mass between two frames [units^2 / s^2], each given by the keypoints
-        of the objects, their centres of mass and their rotations. What keypoints move beside these is deformation.
+        """Kinetic and potential energy per unit mass between two frames [units^2 / s^2].
+
+        Each frame is given by the keypoints, centres of mass and rotations of the objects. Kinetic energy is that of
+        translation, rotation, and deformation: the motion of keypoints relative to the rigid motion.
         """
         points, com, R = ([a - b for a, b in zip(x, y, strict=True)] for x, y in zip(now, before, strict=True))
         kinetic, potential = np.zeros(len(com)), self._g * (now[1] + before[1])[:, 2] / 2
@@ -172,7 +174,7 @@ class PlausibilityMonitor:
         return float(mass @ kinetic / mass.sum()), float(mass @ potential / mass.sum())
 
     def result(self) -> dict:
-        """The measures: of each object by its id, and of the whole scene."""
+        """The measures of each object, by id, and of the whole scene."""
         dt = self._options.dt
         last = np.array(self._com)[-max(2, self._frames // 4) :]
         speed = np.linalg.norm(np.diff(last, axis=0), axis=2).max(0, initial=0) / dt
@@ -196,7 +198,7 @@ class PlausibilityMonitor:
         return float(max(energy.max() - energy[0], 0.0) / converted)
 
     def _warn_of_edges(self) -> None:
-        """Of objects beyond the edge of the table, with engines whose floor has none."""
+        """Warn of objects beyond the edge of the table, with engines whose floor has no edge."""
         if self._table is not None or not self._com:
             return
         far = np.linalg.norm(self._com[-1] - self._origin, axis=1) > self._size
@@ -207,7 +209,7 @@ class PlausibilityMonitor:
                         "--engine rigid does not", o.id, o.name, self._options.engine)  # fmt: skip
 
     def warn(self, result: dict) -> None:
-        """Log what is out of bounds, with the objects and what to do."""
+        """Warn of measures that exceed BOUNDS, with the objects and what to do."""
         materials = choose_materials(self._scene.objects, self._options.material, self._options.materials)
         other = "rigid or mpm" if self._options.engine not in ("rigid", "mpm") else (
             "mpm" if self._options.engine == "rigid" else "rigid, or a higher --quality")  # fmt: skip

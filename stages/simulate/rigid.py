@@ -1,14 +1,14 @@
-"""The rigid-body engine: a body for each object, moved by MuJoCo with Coulomb friction and restitution.
+"""The rigid-body engine: one MuJoCo body per object, with Coulomb friction and restitution.
 
-Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
-object's longest side, the median mass, and SUBSTEPS substeps.
+The simulation is non-dimensional, so that no solver constant depends on the size of the scene or on gravity. The unit
+of length is the longest side of the smallest object, that of mass the median mass, that of time SUBSTEPS substeps.
 
-Contacts rebound and have exact Coulomb friction (`contact_forces.py`); that of a pair is the larger coefficient, as in
-the other engines. Round bodies are balls or cylinders, which a loss of energy in the contact slows down as they roll;
-sides of cylinders touch along a line (`cylinder_contacts.py`).
-Bodies that are not convex touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
-(`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
-is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.
+Contacts have restitution and exact Coulomb friction (`contact_forces.py`); a pair has the larger of its two friction
+coefficients, as in the other engines. Round objects are balls or cylinders with rolling resistance; the sides of two
+cylinders touch along a line (`cylinder_contacts.py`). Non-convex bodies collide with their surfaces
+(`surface_contacts.py`). Overlaps at the start are kept (`initial_overlaps.py`), and objects of photos stay at rest
+until disturbed (`resting_bodies.py`). An object with more than half of it below the floor stands on something else,
+such as the ground beside a table: it gets a plane of its own, with which no other body collides.
 """
 
 from __future__ import annotations
@@ -56,15 +56,18 @@ from stages.simulate.surface_contacts import BodyFrame, SurfaceContacts, Surface
 from stages.simulate.table_edges import TableEdges
 
 log = logging.getLogger(__name__)
-MAX_SUBSTEPS = 5_000  # in a frame
-MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
-ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
+MAX_SUBSTEPS = 5_000  # per frame
+MAX_TRAVEL = 0.05  # largest displacement in a substep, against tunnelling [size of the smallest object]
+ON_FLOOR = 0.02  # largest gap between the floor and a body that stands on it [simulation units]
 
 
 def rollout(
     scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
-    """One state per frame, the first being the start. Raises InputError when the motion is no longer finite."""
+    """Yield one state per frame, the first of which is the initial state.
+
+    Raises InputError if the motion is no longer finite.
+    """
     setup = set_up_scene(scene, prompts, options)
     bodies = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
@@ -76,7 +79,7 @@ def rollout(
 def _states(
     world: _World, keypoints: Keypoints, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
-    """Keypoints moved with their bodies."""
+    """Yield the states of all frames; keypoints move rigidly with their bodies."""
     scene, bodies = world.scene, world.bodies
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.shape.com for b in bodies])
@@ -85,7 +88,7 @@ def _states(
     current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
         centre, quat = world.pose()
-        moved = (torch.cat([centre, quat], 1) != first).any(1, keepdim=True)  # the others are without rounding
+        moved = (torch.cat([centre, quat], 1) != first).any(1, keepdim=True)  # other objects keep their exact positions
         centre = torch.where(moved, centre / scene.metres_per_unit, middle)
         check_motion(torch.cat([centre, quat[:, 1:]]), frame, options)
         positions = torch.where(moved[row], centre[row] + (matrix(quat)[row] @ arm)[..., 0], placed)
@@ -104,7 +107,10 @@ def _states(
 
 
 def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[Body]:
-    """The bodies where the scene has them; what lies below the floor is cut off, if most is above it."""
+    """The objects as rigid bodies at their initial positions.
+
+    Parts below the floor are cut off, except of objects that are mostly below it.
+    """
     unit, bodies = scene.metres_per_unit, []
     floor = setup.box.low[2]
     shapes = standing_shapes(scene, options.seed, floor)
@@ -134,7 +140,7 @@ def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: Sim
 
 
 class _World:
-    """MuJoCo's model and state of the bodies."""
+    """MuJoCo's model and state of the bodies, and the contacts that replace MuJoCo's own."""
 
     def __init__(self, scene: Scene, setup: SceneSetup, bodies: list[Body], prompts: ForcePrompts,
                  options: SimulateOptions):  # fmt: skip
@@ -143,7 +149,7 @@ class _World:
         mujoco.set_mju_user_warning(log.debug)  # by default it writes a file where the command was started
         self._mujoco, self.bodies, self._dt = mujoco, bodies, options.dt
         self.scene, self._ids = scene, [o.id for o in scene.objects]
-        self._held: dict[int, np.ndarray] = {}  # free bodies that are held during the simulation -> their pose
+        self._held: dict[int, np.ndarray] = {}  # row among the free bodies -> pose, of bodies pinned by a change
         self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
         unit = scene.metres_per_unit
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
@@ -153,7 +159,7 @@ class _World:
         fall = max(float(b.start[2]) for b in bodies) - (floor if table is None else unit * table.ground)
         speed = max(float(v.norm()) for v in velocity) + math.sqrt(2 * abs(options.gravity) * max(fall, size))
         mass_of = {o.id: b.mass for o, b in zip(scene.objects, bodies, strict=True)}
-        # forces that last less than a frame are impulses, of which live sessions know nothing at the start
+        # forces shorter than a frame are impulses and do not count: a live session does not know them at the start
         pushes = ((math.hypot(*f.force) + math.hypot(*f.torque) / size) / mass_of[f.object_id] for f in prompts.forces
                   if f.end - f.start > options.dt)  # fmt: skip
         acceleration = max(abs(options.gravity), *pushes, 1e-9)
@@ -182,14 +188,14 @@ class _World:
         self._cylinders = CylinderContacts(mujoco, self.model)
         self._find_contacts = cache(partial(self._initial_contacts, setup, table, at_rest, options))
         self._has_moved = False
-        if options.live:  # the first drag does not wait for them
+        if options.live:  # now, so that the user's first drag does not wait for it
             self._find_contacts()
         self.release(i for i in self._free if i not in at_rest)
 
     def _initial_contacts(
         self, setup: SceneSetup, table: TableOutline | None, at_rest: list[int], options: SimulateOptions
     ) -> None:
-        """What touches what at the start, which only matters once something moves."""
+        """Find the initial overlaps, contacts and supports; deferred until something moves, which needs them."""
         lift = setup.lift.double().numpy()[self._free] * self.scene.metres_per_unit / self.units.length
         self._find_positions()
         self._overlaps = InitialOverlaps(self.model, self.data)
@@ -201,20 +207,20 @@ class _World:
         self.data.qpos.reshape(-1, FREE)[:, :3] += lift
 
     def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:
-        """The forces from now on; those on pinned objects have no effect."""
+        """Set the forces that act from now on; forces on pinned objects have no effect."""
         rows = ((f, self._ids.index(f.object_id)) for f in forces if f.object_id not in pinned)
         self._forces = [(f, row, None if f.at is None else self._arm(f.at, row)) for f, row in rows]
 
     def _arm(self, at, row: int) -> np.ndarray:
-        """From the centre of mass to the point of application, in the body's frame."""
+        """Vector from the centre of mass to the point of application `at`, in the body's frame [simulation units]."""
         com = self.bodies[row].shape.com
         return ((torch.tensor(at) - com) * self.scene.metres_per_unit / self.units.length).double().numpy()
 
     def change(self, materials: dict[int, MaterialChoice], pinned: Collection[int], options: SimulateOptions) -> None:
-        """Other materials, pins, friction and gravity from now on; objects pinned at the start stay so."""
+        """Change materials, pins, friction and gravity from now on; objects pinned at the start stay pinned."""
         model = self.model
         model.opt.gravity[2] = -options.gravity * self.units.time**2 / self.units.length
-        self.mass = self.mass.clone()  # frames that were yielded keep theirs
+        self.mass = self.mass.clone()  # states that were yielded refer to the old tensor
         for row, id in enumerate(self._ids):
             m, b = materials[id].material, self.bodies[row]
             factor = m.density / b.material.density * b.mass / self.units.mass / model.body_mass[row + 1]
@@ -236,7 +242,7 @@ class _World:
         return centre * self.units.length, quat
 
     def _at_rest(self, scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[int]:
-        """Rows of the objects that are at rest in photos and that no prompt moves at the start."""
+        """Rows of the objects that photos show at rest and that no prompt lifts or throws at the start."""
         if not held_as_seen(scene, options) or options.gravity <= 0:
             return []
         return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
@@ -262,7 +268,7 @@ class _World:
         return TableEdges(self._mujoco, self.model, self.data, outline, corners)
 
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
-        """`data` has the objects as they are in the photos, without lifts."""
+        """The bodies held at rest; the poses in `data` must be as reconstructed, without lifts."""
         unit = self.scene.metres_per_unit / self.units.length
         lift = setup.lift.double().numpy() * unit
         self.model.geom_margin[:] = SUPPORT_GAP
@@ -281,7 +287,10 @@ class _World:
         return resting
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (k, 2) of bodies with gaps of up to SUPPORT_GAP, and normals (k, 3) from the first to the second."""
+        """Pairs (k, 2) of bodies that touch, and contact normals (k, 3) from the first to the second body.
+
+        MuJoCo's contacts have gaps up to the current geom_margin, SUPPORT_GAP.
+        """
         contact = self.data.contact
         pairs, normal = self.model.geom_bodyid[contact.geom], contact.frame[:, :3]
         kept = contact.exclude == 0
@@ -291,7 +300,7 @@ class _World:
         return np.concatenate([pairs[kept], near[0]]), np.concatenate([normal[kept], near[1]])
 
     def release(self, rows: Iterable[int]) -> None:
-        """Let objects move that rested until now."""
+        """Release the held objects at these rows, and those that rest on them."""
         bodies = [i + 1 for i in rows]
         if not bodies:
             return
@@ -302,7 +311,7 @@ class _World:
             log.debug("moved from rest: %s", ", ".join(self.scene.objects[i - 1].name for i in released))
 
     def advance(self, time: float) -> None:
-        """Advance by a frame that begins at `time` [s]."""
+        """Advance by one frame that begins at `time` [s]."""
         step = self._dt / self.substeps
         acting = [row for row in self._forces if row[0].active_fraction(time, time + self._dt) > 0]
         self.release(row for _, row, _ in acting)
@@ -315,7 +324,7 @@ class _World:
             self._step()
 
     def _step(self) -> None:
-        """A substep. What contacts release takes part in them."""
+        """Advance by one substep, in which held bodies that contact forces release already move."""
         self._find_forces()
         while self._resting.release_disturbed(self.data):
             self._find_forces()
@@ -326,7 +335,7 @@ class _World:
             self.data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
     def _find_forces(self) -> None:
-        """As mj_forward, with other contacts and references."""
+        """Compute the accelerations like mj_forward, with our own contacts and contact forces."""
         mujoco, model, data = self._mujoco, self.model, self.data
         self._find_positions()
         found = data.ncon
@@ -349,7 +358,7 @@ class _World:
             mujoco.mj_fwdConstraint(model, data)
 
     def _find_positions(self) -> None:
-        """As mj_fwdPosition up to the contacts, with those of cylinders."""
+        """Compute positions, inertia and contacts like mj_fwdPosition, with our own contacts between cylinders."""
         mujoco = self._mujoco
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
                       mujoco.mj_collision):  # fmt: skip
@@ -357,12 +366,12 @@ class _World:
         self._cylinders.replace(self.data)
 
     def _centre_gyroscopic_torques(self) -> None:
-        """Take them at the angular velocities in the middle of the substep, by a step of Newton's method: MuJoCo takes
-        those at its start, which gives energy to bodies that tumble, and without bound to slender ones.
+        """Evaluate the gyroscopic torques at the angular velocity in the middle of the substep, by one Newton step.
 
+        MuJoCo evaluates them at its start, which adds energy to tumbling bodies, without bound to slender ones.
         Source: Catto 2015, "Numerical methods" (Game Developers Conference).
         """
-        # in the frames of the bodies; not changed by a common factor of torque and inertia
+        # in body frames; the result is invariant to a common scale of torque and inertia
         spin, torque = (x.reshape(-1, FALLING)[:, 3:] for x in (self.data.qvel, self.data.qfrc_bias))
         inertia, half = self._inertia, self.model.opt.timestep / 2
         momentum = np.einsum("nij,nj->ni", inertia, spin)
@@ -370,7 +379,7 @@ class _World:
         torque[:] = (inertia @ np.linalg.solve(inertia + half * slope, torque[..., None]))[..., 0]
 
     def _apply_forces(self, acting: list, time: float, step: float) -> None:
-        """Set the mean force and torque on each body during a substep."""
+        """Set the force and torque on each body, averaged over the substep from `time` to `time + step` [s]."""
         self.data.xfrc_applied[:] = 0
         for f, row, arm in acting:
             active = f.active_fraction(time, time + step)
@@ -382,7 +391,7 @@ class _World:
 
 
 def _crosses(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """The matrices of the cross products v x."""
+    """Skew-symmetric matrices of the cross products v x."""
     out = np.zeros((len(v), 3, 3))
     x, y, z = v.T
     out[:, 2, 1], out[:, 0, 2], out[:, 1, 0] = x, y, z

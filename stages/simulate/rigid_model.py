@@ -1,4 +1,4 @@
-"""MuJoCo's model of rigid bodies, and the units in which it is simulated."""
+"""The MuJoCo model of the rigid bodies, and its units."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torch import Tensor
 from stages.core.physics.materials import Material
 from stages.core.physics.rigid_shapes import RigidShape
 
-SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
-CONTACT_SUBSTEPS = 12  # half a period of the springs that push bodies apart
-IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
-SOLIMP = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]  # as MuJoCo has it: the same at all depths
-OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
+SUBSTEPS = 200  # substeps per unit of time, in which the smallest object falls half its size from rest
+CONTACT_SUBSTEPS = 12  # half a period of the contact springs that resolve penetration [substeps]
+IMPEDANCE = 0.99  # MuJoCo's constraint impedance d; d = 1 is rigid, but leaves redundant contact forces undetermined
+SOLIMP = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]  # MuJoCo's solimp: the same impedance at all depths
+OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of the contact springs [1 / unit of time]
 
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the simulation."""
+    """The units of the simulation in SI units."""
 
     length: float  # [m]
     time: float  # [s]
@@ -36,22 +36,22 @@ class Units:
 
 @dataclass(frozen=True)
 class Body:
-    """An object as a rigid body, in metres and kilograms."""
+    """An object as a rigid body."""
 
-    shape: RigidShape  # in scene units, where reconstructed
+    shape: RigidShape  # at the reconstructed position [scene units]
     material: Material
     friction: float
-    mass: float
-    start: Float[Tensor, "3"]  # centre of mass at the start
+    mass: float  # [kg]
+    start: Float[Tensor, "3"]  # centre of mass at the start [m]
     pinned: bool
-    ground: float  # height of the plane under it [m]
+    ground: float  # height of the plane on which it stands [m]
 
     def rolling_arm(self, gravity: float) -> float:
-        """Moment that resists rolling on a rigid plane, of a ball or cylinder under its weight, per weight [m].
+        """Rolling resistance of a ball or cylinder on a rigid plane: moment divided by weight [m].
 
-        3/16 of the radius of contact of a ball, or 2 / (3 pi) of half its width of a cylinder, times the fraction of
-        the energy that a cycle of compression loses: Johnson 1985, "Contact mechanics", section 9.4, with contacts by
-        Hertz. `gravity` in m/s^2.
+        3/16 of the contact radius of a ball, or 2 / (3 pi) of the contact half-width of a cylinder, times the fraction
+        of energy lost in a compression cycle (Johnson 1985, "Contact mechanics", section 9.4, with Hertzian contacts).
+        `gravity` in m/s^2.
         """
         m, weight = self.material, self.mass * abs(gravity)
         yielding = (1 - m.nu**2) / m.E
@@ -64,21 +64,24 @@ class Body:
 
     @property
     def unit(self) -> float:
-        """Metres in a scene unit."""
+        """Metres per scene unit."""
         return float(self.mass / (self.material.density * self.shape.volume)) ** (1 / 3)
 
 
 def restitution(loss: float) -> float:
-    """Share of the speed that half an oscillation of a spring with this loss factor leaves."""
+    """Coefficient of restitution: ratio of the speeds after and before half an oscillation with this loss factor."""
     return math.exp(-math.pi * loss / 2)
 
 
 def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: Sequence[float], box: Sequence | None,
                  around: Sequence):  # fmt: skip
-    """MuJoCo's model: a body for each object, with its convex hull as a mesh or a ball for a round one; planes for
-    the `levels`, of which the first is the floor, and each wall of `box` (its low and high corner), and the fixed boxes
-    `around`, as pairs of corners; then a body for the ground under each object that is below the floor. `gravity`, the
-    heights of the levels and the corners are in `units`.
+    """Build and compile the MuJoCo model.
+
+    The world has a plane at each height of `levels`, of which the first is the floor; planes for the walls and the
+    ceiling of `box` (its lower and upper corner); and the fixed boxes `around` (lower and upper corners). Each object
+    is a body with one geometry: a ball, a cylinder, or the mesh of its convex hull. After them follows a body with a
+    ground plane for each object that stands below the floor. `gravity`, `levels`, `box` and `around` are in `units`.
+    Raises MemoryError if the model does not fit into memory.
     """
     import mujoco  # noqa: PLC0415 -- slow to import
 
@@ -86,8 +89,8 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     spec.option.timestep = 1 / SUBSTEPS
     spec.option.gravity = [0, 0, -gravity]
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
-    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two hulls; always so from version 4
+    spec.option.impratio = 10  # friction is this much stiffer than the normal force, so that bodies hold on slopes
+    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two hulls; version 4 always has them
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
     planes = [((0.0, 0.0, level), (0.0, 0.0, 1.0)) for level in levels]
     if box:
@@ -112,7 +115,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, levels: S
     try:
         return spec.compile()
     except (RuntimeError, ValueError) as error:
-        # what it makes of std::bad_alloc, and of Qhull without memory: the hulls are of Qhull already
+        # MuJoCo's reports of std::bad_alloc and of Qhull out of memory; the vertices already come from hulls by Qhull
         if "unknown exception" in str(error) or "qhull error" in str(error):
             raise MemoryError("MuJoCo cannot compile the model") from error
         raise
@@ -130,7 +133,7 @@ def _add_body(spec, name: str, b: Body, units: Units, gravity: float) -> None:
         body.add_freejoint()
     ball, cylinder = b.shape.ball, b.shape.cylinder
     solid = ball or cylinder
-    if solid is not None:  # a polyhedron loses energy where it rolls over its edges
+    if solid is not None:  # a polyhedron would lose energy at each edge over which it rolls
         arm = b.rolling_arm(gravity * units.length / units.time**2) / units.length
         at = (solid.centre - b.shape.com.double().numpy()) * scale
         quat, size = np.array([1.0, 0.0, 0.0, 0.0]), [solid.radius * scale, 0, 0]

@@ -1,4 +1,4 @@
-"""Initial state, common to all engines: bodies, materials, the floor, lifts and the domain."""
+"""The initial state, common to all engines: particles, materials, floor, lifts and domain."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class SceneSetup:
     bodies: Bodies  # particles at the reconstructed position
     materials: dict[int, MaterialChoice]  # by object id
     lift: Float[Tensor, "o 3"]  # displacement by --lift, part of the output
-    on_floor: Bool[Tensor, "o"]  # standing on the floor once lifted
-    floor_offset: Float[Tensor, "o 3"]  # displacement onto the floor within the simulation only, not part of the output
-    bottom: Float[Tensor, "o"]  # lowest point of each object as reconstructed
-    on_floor_as_seen: Bool[Tensor, "o"]  # standing on the floor as reconstructed
+    on_floor: Bool[Tensor, "o"]  # stands on the floor after the lift
+    floor_offset: Float[Tensor, "o 3"]  # displacement onto the floor; internal, not part of the output
+    bottom: Float[Tensor, "o"]  # height of the lowest point of each object as reconstructed
+    on_floor_as_seen: Bool[Tensor, "o"]  # stands on the floor as reconstructed
     box: Box  # floor, walls and ceiling
 
     @property
@@ -47,14 +47,14 @@ class SceneSetup:
         return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
 
     def warn_of_lifted(self, scene: Scene) -> None:
-        """Log the objects that reach far below the floor; for engines that put them on it."""
+        """Warn of objects that reach far below the floor; for engines that place them on it."""
         for o, raised in zip(scene.objects, self.floor_offset[:, 2].tolist(), strict=True):
             if raised > 4 * self.bodies.spacing:
                 log.warning("object %d (%s) extends %.3g below the floor; it is placed on the floor",
                             o.id, o.name, raised)  # fmt: skip
 
     def uneven_moments(self, row: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
-        """`material_parts.uneven_moments` of an object."""
+        """`material_parts.uneven_moments` of the object at this row."""
         mine = self.bodies.body == row
         return uneven_moments(list(self.materials.values())[row], self.bodies.x[mine], self.bodies.volume[mine])
 
@@ -62,10 +62,10 @@ class SceneSetup:
 def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, refinement: int = 0) -> SceneSetup:
     """Sample the particles, choose the materials and place the objects in the domain.
 
-    Objects whose bottom is within two particle spacings of the floor, or below it, are moved onto it. With a
-    `refinement` of 1 or more, particles fill the bodies up to the surface at the spacing of the quality level divided
-    by it; without, they leave the outermost layer empty. Raises InputError for a --box that does not contain the
-    objects.
+    Objects whose lowest point is within two particle spacings of the floor, or below it, are moved onto it. With a
+    `refinement` of 1 or more, particles fill the bodies up to the surface, at the particle spacing of the quality level
+    divided by `refinement`; with 0 they leave the outermost layer empty. Raises InputError if --box does not contain
+    the objects.
     """
     bodies = sample_bodies(scene, options.level.particles, options.seed, skin=refinement > 0)
     if refinement:
@@ -75,11 +75,11 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
         lift[row, 2] = prompts.lift.get(o.id, 0.0)
-    # a body ends at the faces of voxels, or where their upper parts are filled; without the outermost layer the visible
-    # body ends a spacing and a half below its particles
+    # Lowest point: the lower face of a particle's voxel, or that of the filled upper part of a voxel that is partly
+    # filled. Without the outermost layer the visible body ends 1.5 spacings below its lowest particles.
     below = 0.5 if refinement else 1.5
     ends = bodies.x[:, 2] - below * h
-    if refinement:  # particles are beside the middles of their voxels
+    if refinement:  # particles are not at the centres of their voxels
         ends = ((bodies.x[:, 2] / h).floor() + 1) * h - bodies.volume / h**2
     bottom = torch.stack([ends[bodies.body == row].quantile(0.01) for row in range(count)])
     start = bottom + lift[:, 2]
@@ -95,7 +95,7 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
     box = asked or _default_box(x, floor, h)
     box = Box((*box.low[:2], floor), box.high)
     low, high = torch.tensor(box.low), torch.tensor(box.high)
-    # particles below the 1 % quantile may still lie under the floor, which would throw them up
+    # particles below the 1 % quantile may still be under the floor, which would eject them
     x[:, 2].clamp_(min=floor + (below - 0.25) * h)
     outside = ((x < low) | (x > high)).any(1)
     if bool(outside.any()):
@@ -109,7 +109,7 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
 
 
 def choose_for_bodies(scene: Scene, bodies: Bodies, options: SimulateOptions) -> dict[int, MaterialChoice]:
-    """The materials that the options name, by object id, each the average of its parts over the object's body."""
+    """The materials that the options select, by object id; those of parts are averaged over the object's particles."""
     chosen = choose_materials(scene.objects, options.material, options.materials)
     for row, o in enumerate(scene.objects):
         mine = bodies.body == row
@@ -118,7 +118,7 @@ def choose_for_bodies(scene: Scene, bodies: Bodies, options: SimulateOptions) ->
 
 
 def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, bottom: Float[Tensor, "o"]) -> float:
-    """Height of the floor: --floor over --box over the scene over the lowest object."""
+    """Height of the floor: the first known of --floor, --box, the scene, and the lowest point of the objects."""
     if options.floor is not None:
         return options.floor
     if box is not None:
@@ -131,7 +131,7 @@ def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, botto
 
 
 def parse_box(text: str) -> Box:
-    """The domain of --box "x0,y0,z0,x1,y1,z1": lower and upper corner. Raises InputError if malformed."""
+    """Parse the domain of --box, "x0,y0,z0,x1,y1,z1": lower and upper corner. Raises InputError if malformed."""
     where, parts = f"--box {text!r}", text.split(",")
     if len(parts) != 6:
         raise InputError(f"{where}: write x0,y0,z0,x1,y1,z1")
@@ -142,15 +142,15 @@ def parse_box(text: str) -> Box:
 
 
 def _extent(x: Float[Tensor, "p 3"]) -> str:
-    """Ranges of the coordinates, for an error message."""
+    """The ranges of the coordinates, for an error message."""
     low, high = x.amin(0), x.amax(0)
     return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(low.tolist(), high.tolist(), strict=True))
 
 
 def _default_box(x: Float[Tensor, "p 3"], floor: float, h: float) -> Box:
-    """Twice the extent of the objects, and to the sides at least their height above the floor.
+    """A domain of twice the largest extent of the objects, with at least their height above the floor at the sides.
 
-    Reduced where the MPM grid would take too much memory.
+    It is smaller if the MPM grid would take too much memory.
     """
     low, high = x.amin(0), x.amax(0)
     size = float((high - low).max())
@@ -166,35 +166,35 @@ def _default_box(x: Float[Tensor, "p 3"], floor: float, h: float) -> Box:
 
 
 def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOptions) -> None:
-    """Raise InputError if points [scene units] are not finite, or too far away for a trajectory file."""
+    """Raise InputError if points [scene units] are not finite or too far away for a trajectory file."""
     if not bool((points.abs() < LARGEST).all()):
         raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity or "
                          "--force, or another --engine")  # fmt: skip
 
 
 def table_of(scene: Scene, options: SimulateOptions) -> TableOutline | None:
-    """The outline of the table of a scene of photos; None where the floor has no edge, or options place another."""
+    """The outline of the table of a scene of photos; None if no edge is visible or the options place the floor."""
     given = options.floor is not None or options.box
     return None if given or not from_photos(scene) else table_outline(scene, str(pick_device(options.device)))
 
 
 def from_photos(scene: Scene) -> bool:
-    """Whether `ngff reconstruct` is among the commands that made a scene."""
+    """Whether `ngff reconstruct` is among the commands that made the scene."""
     return "reconstruct" in scene.commands
 
 
 def starts_released(scene: Scene, options: SimulateOptions) -> bool:
-    """Whether all objects move from the start: with --no-rest, and in films, which begin as they are released."""
+    """Whether all objects may move from the start: with --no-rest, and in films, which begin with the release."""
     return not options.rest or scene.sequence is not None
 
 
 def held_as_seen(scene: Scene, options: SimulateOptions) -> bool:
-    """Whether objects are at rest where photos show them."""
+    """Whether objects are held at rest where photos show them."""
     return from_photos(scene) and not starts_released(scene, options)
 
 
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
-    """Log that the sides that no photo shows are missing, unless `ngff refine` has added them."""
+    """Log that sides not visible in any photo are missing, unless `ngff refine` has added them."""
     if from_photos(scene) and "refine" not in scene.commands:
         log.info("%s: the sides that no photo shows are missing, so that objects may be too light and hollow; "
                  "`ngff refine` adds them", path)  # fmt: skip

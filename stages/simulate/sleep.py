@@ -1,10 +1,10 @@
 """Sleeping objects: objects at rest at the start keep their position until another object hits them.
 
-Photos show a static equilibrium, which a learned force field holds only approximately, and reconstructed objects
-overlap a little and would be pushed apart. Rigid body engines put islands of bodies at rest to sleep in the same way.
+Photos show a static equilibrium, which a learned force field maintains only approximately, and reconstructed objects
+overlap slightly and would be pushed apart. Rigid-body engines put islands of bodies at rest to sleep in the same way.
 
-Limits: support is contact in any direction, so an object that hangs in the air in contact with a supported one
-sleeps too; and objects that come to rest later do not fall asleep.
+Limits: contact in any direction counts as support, so an object in mid-air that touches a supported one sleeps too.
+Objects that come to rest later do not fall asleep.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper
 
 CONTACT_DISTANCE = 0.05  # distance at which objects touch, in addition to half the keypoint spacing [m]
-INITIAL_CONTACT_DISTANCE = 0.1  # the same at the start, as photos show little of contact regions [m]
+INITIAL_CONTACT_DISTANCE = 0.1  # contact distance at the start, as photos show little of contact regions [m]
 WAKE_SPEED = 0.25  # minimum speed that a perfectly inelastic impact must give an object to wake it [m/s]
 
 
 class SleepState:
     """Tracks which of `o` objects are `asleep`.
 
-    At the start, the objects that are not `awake` sleep if they are `standing` on the floor or touch a sleeping object
-    that is itself supported. Contacts are found on the device of `initial`; masks of objects are on the CPU.
+    At the start, objects that are not `awake` sleep if they are `standing` on the floor or touch a supported sleeping
+    object. Contacts are found on the device of `initial`; masks of objects are on the CPU.
     """
 
     def __init__(self, initial: InitialConditions, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
@@ -39,7 +39,7 @@ class SleepState:
         self._before = initial.points
 
     def advance(self, stepper: TimeStepper, steps: int, pinned: Bool[Tensor, "o"]) -> None:
-        """Make the steps of a frame, with the objects `pinned` or asleep not moving, and wake those that are hit."""
+        """Make the steps of one frame without moving `pinned` and sleeping objects; then wake those that are hit."""
         stepper.external.pinned.copy_(pinned | self.asleep)
         for _ in range(steps):
             stepper.step()
@@ -50,7 +50,7 @@ class SleepState:
     def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> None:
         """Wake objects hit by an awake object, and those that they supported.
 
-        `points` [m] and their velocities `speed` [m/s] in model units.
+        `points` [m] and their velocities `speed` [m/s] are in model units.
         """
         if not bool(self.asleep.any()):
             return
@@ -65,7 +65,7 @@ class SleepState:
         self._wake_unsupported()
 
     def _near(self, points: Float[Tensor, "1 o n 3"], gap: float) -> Bool[Tensor, "o o n"]:
-        """Mask of the keypoints of object i (first) that touch object j (second)."""
+        """Mask [i, j, k]: keypoint k of object i touches object j."""
         limit = gap + torch.maximum(self.spacing[:, None], self.spacing) / 2
         distance, _ = nearest(points, self.valid, float(limit.max()))
         return distance[0] < limit[..., None]
@@ -82,7 +82,7 @@ class SleepState:
 
 
 def _keypoint_spacing(initial: InitialConditions) -> Float[Tensor, "o"]:
-    """Approximate distance between the keypoints of each object [m], as if spread over its bounding box's surface."""
+    """Approximate keypoint spacing of each object [m], as if keypoints were spread over its bounding box's surface."""
     hidden = ~initial.valid[0, ..., None]
     high = initial.points[0].masked_fill(hidden, -torch.inf).amax(1)
     a, b, c = (high - initial.points[0].masked_fill(hidden, torch.inf).amin(1)).unbind(-1)

@@ -1,4 +1,4 @@
-"""Bodies of the learned engine: keypoints with masses, and the volume and inertia of the filled object."""
+"""Mass properties for the learned engine: volume, centre of mass and inertia of filled objects; masses of keypoints."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from stages.core.physics.signed_distance import distance_grid, mass_properties
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-SMALLEST_SHARE = 0.1  # least mass of a keypoint relative to the mean, when the centre of mass is matched
+SMALLEST_SHARE = 0.1  # lower bound of the mass of a keypoint, relative to the mean mass
 
 
 @dataclass(frozen=True)
 class SolidBody:
-    """The filled body of an object at its reconstructed position, in scene units."""
+    """Mass properties of a filled object of uniform density at its reconstructed position, in scene units."""
 
     volume: float
-    centre: Float[Tensor, "3"]  # of mass
-    inertia: Float[Tensor, "3 3"]  # about the centre of mass, per unit of mass
+    centre: Float[Tensor, "3"]  # centre of mass
+    inertia: Float[Tensor, "3 3"]  # inertia tensor about the centre of mass, per unit mass
 
 
 @cached_in_scene
 def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidBody]:
-    """The solid body of every object, from the centres of its Gaussians; open sheets get the thickness `sheet`.
+    """The solid bodies of all objects, in their order, from the centres of their Gaussians.
 
-    They are computed on `device`.
+    Open sheets get the thickness `sheet` [scene units]. The signed distance grids are computed on `device`.
     """
     g = scene.gaussians.to("cpu")
     good = usable(g)
@@ -46,9 +46,9 @@ def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidB
 
 
 def mass_fractions(points: Float[Tensor, "k 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "k"]:
-    """Fractions of the mass at points, as equal as possible and with the given centre of mass.
+    """Mass fractions of points, as equal as possible in the least-squares sense, with the given centre of mass.
 
-    Least squares; where that takes less than SMALLEST_SHARE at a point, the centre is approximated.
+    Fractions are clamped to SMALLEST_SHARE of the mean; the centre of mass is then only approximate.
     """
     offset = (points - points.mean(0)).double()
     spread = offset.T @ offset / len(points)

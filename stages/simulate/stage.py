@@ -28,7 +28,7 @@ from stages.simulate.plausibility import PlausibilityMonitor
 from stages.simulate.setup import tell_of_unseen_sides
 
 log = logging.getLogger(__name__)
-MIN_EXTENT = 1e-5  # of an object, relative to its coordinates, which have 24 bits
+MIN_EXTENT = 1e-5  # smallest extent of an object, relative to its coordinates, which have 24 bits of precision
 
 
 def run(
@@ -38,9 +38,9 @@ def run(
 ) -> None:  # fmt: skip
     """Simulate the objects of a scene: scene.ply -> traj.h5.
 
-    With --live it runs until Ctrl-C. `given`: names of the options that a recording (--forces) does not replace, beside
-    those that differ from their defaults. Raises InputError for wrong options or input, and when the simulation
-    diverges; the frames up to then are kept in OUT.partial.h5.
+    With --live the simulation runs until Ctrl-C. `given`: names of options that a recording (--forces) does not
+    replace, in addition to those that differ from their defaults. Raises InputError for wrong options or input, and if
+    the simulation diverges; the frames so far are then kept in OUT.partial.h5.
     """
     began, options = time.monotonic(), with_recorded(options, given)
     options = replace(options, keypoints=options.keypoint_count)
@@ -89,7 +89,7 @@ def run(
 
 
 def _tell_of_idle_prompts(prompts: forces.ForcePrompts, scene: Scene, options: SimulateOptions) -> None:
-    """Warn of prompts that contradict others or the length of the simulation, and so change nothing."""
+    """Warn of prompts without effect: those that contradict others, or begin after the end of the simulation."""
     for id in sorted(prompts.pinned & prompts.velocity.keys()):
         log.warning("object %d (%s) is held by --pin, so that its --velocity has no effect", id, scene.name_of(id))
     end = (options.steps - 1) * options.dt
@@ -100,10 +100,10 @@ def _tell_of_idle_prompts(prompts: forces.ForcePrompts, scene: Scene, options: S
 
 
 def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> SimulateOptions:
-    """With --forces RECORDING the options that made it, and its number of frames, where none are given.
+    """With --forces RECORDING, replace options that are not given by those of the recording, and `steps` by its length.
 
-    Not those that name other files (--materials, --weights), which must be given again, nor those of the recorded
-    engine where another one is given.
+    Options that name other files (--materials, --weights) must be given again. If another engine is given, the options
+    of the recorded engine are ignored.
     """
     recording = None if options.forces is None else read_recording(options.forces)
     if recording is None:
@@ -116,10 +116,10 @@ def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> Simu
 
 
 def with_objects(scene: Scene, path: Path, seed: int = 0, device: str = "auto") -> Scene:
-    """The scene with the objects that can move; one without labelled Gaussians is segmented as by `ngff segment`.
+    """The scene with the objects that can move; an unlabelled scene is segmented as by `ngff segment`.
 
-    `seed` and `device` are of the segmentation. Objects without Gaussians, or without extent, are left out. Raises
-    InputError when no object is found.
+    `seed` and `device` are for the segmentation. Objects without Gaussians or extent are left out, with a warning.
+    Raises InputError if no object is found.
     """
     present = []
     for o in scene.objects:

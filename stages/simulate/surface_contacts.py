@@ -1,15 +1,16 @@
-"""Contacts of the surfaces of rigid bodies that do not fill their convex hull.
+"""Contacts between the surfaces of rigid bodies that do not fill their convex hull.
 
-Where one of two bodies is not convex, samples of each surface are looked up in the signed distance of the other one
-(`depth_lookup.py`), and those inside are contacts, of which the ones that span the contact of a pair take part. The
-outermost samples of a body that is not convex touch the floor and walls. MuJoCo's contacts of the hulls of such pairs
-are excluded; those of convex bodies and those with the background stay.
+If one of two bodies is non-convex, samples of each surface are looked up in the signed distance grid of the other
+body (`depth_lookup.py`). Samples inside it are contact points; contact reduction keeps those that span the contact
+region of the pair. The outermost samples of non-convex bodies collide with the floor and walls. MuJoCo's contacts
+between the hulls of such pairs are excluded; those between convex bodies and those with the background stay.
 
-The overlap of two bodies at the start is no contact, nor the least one since (`initial_overlaps.py`).
+Penetration depths are reduced by the allowed overlap of the pair (`initial_overlaps.py`).
 
-Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
-distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
-that are far away none is looked at.
+Broad phase: each pair has a Verlet list of the samples that are closer than MARGIN to the other body. It stays valid
+until the paths of the two bodies may add up to MARGIN or, if that is larger, to the distance of the nearest sample. A
+listed sample is looked up only once it may have reached the other body. Samples are grouped by position, so that
+distant groups are skipped as a whole.
 Sources: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
 contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 """
@@ -32,53 +33,54 @@ from stages.core.scene.scene import Scene
 from stages.simulate.initial_overlaps import AllowedOverlaps
 from stages.simulate.standing_surface import StandingSurface
 
-FACING = 0.5  # cosine between a surface and the one it faces up to which all of a depth counts
-MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
-BALL_SAMPLES = 2000  # on the surface of a ball: .08 radii apart
-BALL_NODES = 20  # along its radius: depths between them are interpolated to .001 radii
+FACING = 0.5  # cosine between opposed normals at or above which the full depth counts; below, proportionally less
+MARGIN = 0.05  # distance from the other body within which samples are listed [simulation units]
+BALL_SAMPLES = 2000  # samples on the surface of a ball: .08 radii apart
+BALL_NODES = 20  # grid nodes along the radius of a ball: interpolated depths are accurate to .001 radii
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
-STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
+STEEPEST = 2  # largest slope of depths on a grid: where fine depths meet coarse ones, they differ by up to a voxel
 NONE = np.zeros(0, np.int64), np.zeros(0)
 
 
 @dataclass(frozen=True)
 class SurfaceShape:
-    """Samples of a body's surface, and depths below it at the nodes of a grid, in the body's frame."""
+    """Samples of a body's surface, and a grid of depths below the surface, in the body's frame [simulation units]."""
 
-    points: np.ndarray  # (s, 3)
-    normals: np.ndarray  # (s, 3), outwards
-    flatness: np.ndarray  # (s,), 1 in a plane and 0 at an edge
-    faces: np.ndarray  # (s, 3, 3), normals of up to three faces that meet there, the others 0
-    nearest: np.ndarray  # (x, y, z), sample nearest to each node near the surface
-    depth: np.ndarray  # (x, y, z)
-    low: np.ndarray  # (3,), the first node
-    h: float  # between nodes
-    convex: bool  # fills its convex hull
-    radius: float = 0.0  # of a ball
+    points: np.ndarray  # (s, 3), samples
+    normals: np.ndarray  # (s, 3), outward normals of the samples
+    flatness: np.ndarray  # (s,), of the surface at the samples: 1 in a plane and 0 at an edge
+    faces: np.ndarray  # (s, 3, 3), normals of up to three faces that meet at a sample, padded with 0
+    nearest: np.ndarray  # (x, y, z), row of the sample nearest to each node near the surface; -1 for the other nodes
+    depth: np.ndarray  # (x, y, z), depth at each node, negative outside
+    low: np.ndarray  # (3,), position of the first node
+    h: float  # node spacing
+    convex: bool  # the body fills its convex hull
+    radius: float = 0.0  # of a ball; 0 for other shapes
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of a ball
 
 
 class BodyFrame(NamedTuple):
-    """The frame of a body in the scene."""
+    """The frame of a body, relative to the scene."""
 
-    com: tuple[float, ...]  # its origin
-    scale: float  # units of the simulation per scene unit
+    com: tuple[float, ...]  # centre of mass, which is the origin of the frame [scene units]
+    scale: float  # simulation units per scene unit
 
 
 @cached_in_scene
 def object_shape(
     scene: Scene, object_id: int, seed: int, bottom: float, frame: BodyFrame, hull: tuple[tuple[float, ...], ...]
 ) -> SurfaceShape:
-    """The `surface_shape` of the body of an object; `hull` has the vertices of a convex one.
+    """The `surface_shape` of an object, cut off below the height `bottom`.
 
-    Raises InputError for one without any usable Gaussian.
+    `hull`: vertices of the convex hull if the object fills it, else empty. Raises InputError for an object without
+    usable Gaussians.
     """
     filled = ConvexHull(np.array(hull)) if hull else None
     return surface_shape(StandingSurface(solid_surface(scene, object_id, seed).fitted, filled, bottom), frame)
 
 
 def surface_shape(body: StandingSurface, frame: BodyFrame) -> SurfaceShape:
-    """The shape of a body in this frame."""
+    """Convert the surface of a body from scene units to its frame."""
     com, scale = np.array(frame.com), frame.scale
     points, normals, at_edge = body.points()
     depth, low = body.depth_grid()
@@ -88,7 +90,7 @@ def surface_shape(body: StandingSurface, frame: BodyFrame) -> SurfaceShape:
 
 
 def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:
-    """The shape of a ball, in the frame of its body."""
+    """The shape of a ball, with `centre` (3,) and `radius` in the frame of its body."""
     normals, h = fibonacci(BALL_SAMPLES), radius / BALL_NODES
     low = np.full(3, -(BALL_NODES + 2) * h)
     node = low + h * np.indices((2 * BALL_NODES + 5,) * 3).transpose(1, 2, 3, 0)
@@ -99,9 +101,13 @@ def ball_shape(centre: np.ndarray, radius: float) -> SurfaceShape:
 
 
 class SurfaceContacts:
-    """Finds the contacts of the bodies 1.. of a MuJoCo model, of these shapes, and adds them to its data."""
+    """Finds the surface contacts of the first bodies of a MuJoCo model and adds them to MuJoCo's data.
+
+    Bodies are numbered by their row in `shapes`; body i is the body i + 1 of the model.
+    """
 
     def __init__(self, mujoco, model, data, shapes: Sequence[SurfaceShape]):
+        """The overlaps at the poses in `data` are allowed from then on."""
         self._mujoco, self._model = mujoco, model
         count = len(shapes)
         groups = [_groups(s.points) for s in shapes]
@@ -130,31 +136,36 @@ class SurfaceContacts:
         lowest = [self._first[i] + _hull_corners(s.points) if rough[i] else [] for i, s in enumerate(shapes)]
         self._first_corner = np.cumsum([0, *(len(rows) for rows in lowest)])
         self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
-        self._corners = self._points[np.concatenate(lowest).astype(np.int64)]  # those that can touch planes
-        self._apart = np.where(apart, -np.inf, 0.0)  # added to how far a body is beyond a plane
-        # of each: its friction and damping are those of the body
+        self._corners = self._points[np.concatenate(lowest).astype(np.int64)]  # samples that can touch planes
+        self._apart = np.where(apart, -np.inf, 0.0)  # added to depths beyond planes: excludes pairs that do not collide
+        # first geometry of each body, which has its friction and damping
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
-        self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # -1: fixed
+        self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # body of each geometry; -1: fixed
         self._rough = np.append(rough, False)
         self._dof = model.body_dofadr[1 : count + 1]
-        self._path = np.zeros(count)  # the way that any point of a body has gone at most
-        self._due = np.full((count, count), -np.inf)  # sum of both paths at which the list of a pair must be made again
-        self._way = np.zeros((count, count))  # sum of both paths
+        self._path = np.zeros(count)  # upper bound of the path length of any point of a body so far
+        self._due = np.full((count, count), -np.inf)  # value of _way at which the list of a pair must be rebuilt
+        self._way = np.zeros((count, count))  # sum of the path lengths of both bodies of a pair
         self._lists: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-        self._pairs, self._pair = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)  # with lists; row of each sample
-        self._sample, self._from = NONE  # all lists; way from which on a sample may be inside
+        # all lists, concatenated: pairs that have one; per entry its row in _pairs, sample, and the value of _way from
+        # which on the sample may be inside the other body
+        self._pairs, self._pair = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+        self._sample, self._from = NONE
         fixed = np.zeros(count, bool)
         self._update_lists(data, fixed)
         overlap, below = np.zeros((count, count)), np.zeros((count, len(self._planes)))
         _, _, depth, a, b = self._contacts(data)
         np.maximum.at(overlap, (np.minimum(a, b), np.maximum(a, b)), depth)
-        self._overlaps = AllowedOverlaps(overlap)  # of bodies a < b
+        self._overlaps = AllowedOverlaps(overlap)  # (a, b) with a < b
         row, plane, depth = self._beyond_planes(data, fixed)
         np.maximum.at(below, (self._corner_of[row], plane), depth)
         self._below = AllowedOverlaps(below)
 
     def add(self, data, fixed: np.ndarray) -> None:
-        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move."""
+        """Add surface contacts to those found by mj_collision; `fixed` masks the bodies of the model that do not move.
+
+        Call once per substep: it also integrates the path lengths on which the lists depend.
+        """
         fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
@@ -173,7 +184,7 @@ class SurfaceContacts:
         add_contacts(self._mujoco, self._model, data, AddedContacts(at, normal[k], excess[k], geoms))
 
     def _add_to_planes(self, data, fixed: np.ndarray) -> None:
-        """Contacts of the outermost samples with planes."""
+        """Add the contacts of the outermost samples with planes."""
         row, plane, depth = self._beyond_planes(data, fixed)
         of = self._corner_of[row]
         self._below.note((of, plane), depth, ~fixed[:, None])
@@ -189,19 +200,20 @@ class SurfaceContacts:
         add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], excess[k], geoms))
 
     def exclude(self, data) -> None:
-        """Exclude the contacts between hulls for which there are contacts between surfaces."""
+        """Exclude MuJoCo's contacts between hulls that surface contacts replace."""
         replaced = self.replaced(data.contact.geom)
         data.contact.exclude[replaced] = 1
-        data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        data.contact.efc_address[replaced] = -1  # MuJoCo leaves it undefined if all contacts are excluded
 
     def replaced(self, geom: np.ndarray) -> np.ndarray:
-        """Which (k,) of the contacts of two geometries (k, 2) those of surfaces replace."""
+        """Mask (k,) of the pairs of geometries `geom` (k, 2) whose contacts are replaced by surface contacts."""
         body = self._body[geom]
         return self._rough[body].any(1) & ((body >= 0) | self._is_plane[geom]).all(1)
 
     def touching(self, data) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (k, 2) of bodies of the model of which samples of one are less than MARGIN outside the other, and the
-        normals (k, 3) from the first to the second.
+        """Pairs (k, 2) of bodies of the model that touch, and normals (k, 3) from the first to the second body.
+
+        There is one row for each sample that faces the other body and is inside it or less than MARGIN outside.
         """
         pairs = np.argwhere(self._possible)
         lists, _ = self._near(data, pairs, np.zeros(len(pairs)))
@@ -212,6 +224,7 @@ class SurfaceContacts:
         return np.stack([b[found.row[k]], a[found.row[k]]], 1) + 1, found.normal[k]
 
     def _update_lists(self, data, fixed: np.ndarray) -> None:
+        """Rebuild the lists of the pairs that may have moved too far since their lists were made."""
         self._way = path = self._path[:, None] + self._path
         due = np.argwhere(self._possible & ~(fixed[:, None] & fixed) & (path >= self._due))
         if not len(due):
@@ -235,9 +248,10 @@ class SurfaceContacts:
             self._sample, self._from = (np.concatenate(each) for each in zip(NONE, *self._lists.values(), strict=True))
 
     def _near(self, data, pairs: np.ndarray, way: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-        """For each of some pairs (k, 2) that have gone a way (k,) the samples of the first body that are less than
-        MARGIN outside the second one, each with the way from which on it may be inside; and a way (k,) that both can
-        move until others are.
+        """Lists of the samples of the first body of each pair (k, 2) that are closer than MARGIN to the second body.
+
+        `way` (k,) has the present path lengths of the pairs. Each list has samples, and the path lengths from which on
+        they may be inside. Also returns the path length (k,) that each pair can still move before its list is outdated.
         """
         a, b = pairs.T
         poses = self._poses(data)
@@ -256,15 +270,17 @@ class SurfaceContacts:
         return list(zip(*lists, strict=True))[: len(pairs)], np.maximum(gap, MARGIN)
 
     def _contacts(self, data) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the listed samples inside another body: positions (k, 3), outward normals (k, 3) of that body, depths (k,)
-        in it, less where the surfaces do not face each other, and the rows (k,) of both bodies.
+        """Contacts of listed samples that are inside another body.
+
+        Positions (k, 3), outward normals (k, 3) of the other body, depths (k,) in it, reduced where the surfaces do not
+        face each other, and the rows (k,) of the sampled and of the other body.
         """
         k = np.flatnonzero(self._way[tuple(self._pairs.T)][self._pair] >= self._from)
         a, b = self._pairs[self._pair[k]].T.copy()
         turn, at = self._poses(data)
         row, x, normal, depth, facing = self._lookup.inside(self._sample[k], a, b, turn, at)
         a, b = a[row], b[row]
-        for body, side in ((a, 1), (b, -1)):  # a ball touches where the normal through its centre meets its surface
+        for body, side in ((a, 1), (b, -1)):  # move contact points of balls to where the line of action meets the ball
             row = np.flatnonzero(self._ball[body] > 0)
             of = body[row]
             x[row] = turned(turn[of], self._centre[of]) + at[of] - side * self._ball[of, None] * normal[row]
@@ -273,12 +289,12 @@ class SurfaceContacts:
         return x, normal, depth * (facing / FACING).clip(0, 1), a, b
 
     def _poses(self, data) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (o, 3, 3) and positions (o, 3) of the bodies; the model has others after them."""
+        """Rotations (o, 3, 3) and positions (o, 3) of the bodies; the model has ground bodies after them."""
         end = len(self._path) + 1
         return data.xmat[1:end].reshape(-1, 3, 3), data.xpos[1:end]
 
     def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these."""
+        """Rows (k,) of corners that are beyond a plane, rows (k,) of these planes, and depths (k,) beyond them."""
         normal = data.geom_xmat[self._planes][:, 2::3]
         count = len(self._radius)
         at, turn = data.xpos[1 : count + 1], data.xmat[1 : count + 1].reshape(-1, 3, 3)
@@ -295,12 +311,12 @@ class SurfaceContacts:
 
 
 class AddedContacts(NamedTuple):
-    """Contacts of pairs of a MuJoCo model's geometries."""
+    """Contacts between pairs of geometries of a MuJoCo model."""
 
-    x: np.ndarray  # (k, 3), positions
-    normal: np.ndarray  # (k, 3), from the first geometry to the second one
-    excess: np.ndarray  # (k,), by which they reach into each other
-    geoms: np.ndarray  # (k, 2)
+    x: np.ndarray  # (k, 3), contact points
+    normal: np.ndarray  # (k, 3), from the first to the second geometry
+    excess: np.ndarray  # (k,), penetration depth beyond the allowed overlap
+    geoms: np.ndarray  # (k, 2), ids of the geometries
 
 
 def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
@@ -310,13 +326,13 @@ def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
         getattr(contact, name)[:] = -1
     for _ in range(len(contacts.x)):
         mujoco.mj_addContact(model, data, contact)
-    added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer where memory is short
+    added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer if MuJoCo's arena is full
     x, normal, excess, geoms = (values[kept] for values in contacts)
     one, two = geoms.T
     added.geom1[new], added.geom2[new], added.geom[new] = one, two, geoms
     added.dist[new], added.pos[new] = -excess, x
     added.frame[new] = _frames(normal)
-    # as MuJoCo combines those of two geometries: without any friction its elliptic cones have no normal force either
+    # combined as by MuJoCo; its elliptic cones need a friction above 0, without which they have no normal force either
     friction = np.maximum(model.geom_friction[one], model.geom_friction[two]).clip(mujoco.mjMINMU)
     added.friction[new] = friction[:, [0, 0, 1, 2, 2]]
     added.dim[new] = np.maximum(model.geom_condim[one], model.geom_condim[two])
@@ -324,7 +340,7 @@ def add_contacts(mujoco, model, data, contacts: AddedContacts) -> None:
 
 
 def _ordered(shape: SurfaceShape, order: np.ndarray) -> SurfaceShape:
-    """A shape with its samples in another order."""
+    """A shape with its samples reordered by `order`."""
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     per_sample = {n: getattr(shape, n)[order] for n in ("points", "normals", "flatness", "faces")}
@@ -332,8 +348,10 @@ def _ordered(shape: SurfaceShape, order: np.ndarray) -> SurfaceShape:
 
 
 def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """An order of points (s, 3) by place; and of each of its groups the first row, the middle and the largest distance
-    from it.
+    """Group points (s, 3) by the cells of a coarse grid.
+
+    Returns the order (s,) of the points by group, and for each group its first row in this order, the middle of its
+    bounds and the largest distance of its points from the middle.
     """
     edge = max(float(np.ptp(points, axis=0).max(initial=0)) / GROUPS_ALONG, 1e-12) if len(points) else 1.0
     _, of = np.unique(np.floor(points / edge), axis=0, return_inverse=True)
@@ -346,10 +364,10 @@ def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """Rows of the contacts of each pair that span it in eight directions across the normal, and the deepest.
+    """Contact reduction: rows of the contacts that are extreme in eight tangential directions, and of the deepest ones.
 
-    For each of six directions of the normal. Source: Moravanszky and Terdiman 2004, "Fast contact reduction for
-    dynamics simulation".
+    Chosen separately for each pair and for each of six axis directions nearest to the normal. Source: Moravanszky and
+    Terdiman 2004, "Fast contact reduction for dynamics simulation".
     """
     axis = np.abs(normal).argmax(1)
     row = np.arange(len(x))
@@ -359,8 +377,9 @@ def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.nda
 
 
 def largest_of_groups(values: np.ndarray, key: np.ndarray) -> np.ndarray:
-    """Sorted columns of the largest of each row of values (s, n) in each group of equal keys (n,); of equal values the
-    last.
+    """Columns, sorted, with the largest of values (s, n) of each row in each group of equal keys (n,).
+
+    Of equal values in a group, the last one is taken.
     """
     if not len(key):
         return NONE[0]
@@ -374,7 +393,7 @@ def largest_of_groups(values: np.ndarray, key: np.ndarray) -> np.ndarray:
 
 
 def _frames(normal: np.ndarray) -> np.ndarray:
-    """Unit normals (k, 3) and two directions across each: frames (k, 9).
+    """Contact frames (k, 9): unit normals (k, 3), each followed by two orthonormal tangents.
 
     Source: Duff et al. 2017, "Building an orthonormal basis, revisited".
     """
@@ -386,14 +405,14 @@ def _frames(normal: np.ndarray) -> np.ndarray:
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers (n,) of ranges, one after the other, and the row (n,) of the range of each."""
+    """The concatenated integers (n,) of half-open ranges, and for each the row (n,) of its range."""
     length = end - begin
     row = np.repeat(np.arange(len(length)), length)
     return np.arange(len(row)) + (begin - np.cumsum(length) + length)[row], row
 
 
 def _hull_corners(points: np.ndarray) -> np.ndarray:
-    """Rows of the points at the corners of their convex hull; all of points in a plane."""
+    """Rows of the points that are vertices of their convex hull; all rows if the points are coplanar."""
     try:
         return ConvexHull(points).vertices
     except (QhullError, ValueError):

@@ -1,8 +1,8 @@
-"""The edges of the table in the rigid engine: its floor, an infinite plane, supports only what is over the table.
+"""Table edges in the rigid engine, which limit the infinite plane of the floor to the outline of the table.
 
-Contacts with the floor beyond an edge are excluded. Where a body reaches over an edge, its convex hull is cut by the
-vertical plane through the edge, and what of the cut is below the floor touches it. A body whose centre is beyond an
-edge and below the floor has left the table, which it then no longer touches.
+Contacts with the floor beyond an edge are excluded. If a body overhangs an edge, its convex hull is intersected with
+the vertical plane through the edge, and the points of this section below the floor become contacts. A body whose centre
+is beyond an edge and below the floor has left the table and no longer collides with it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from scipy.spatial import ConvexHull, QhullError
 from stages.core.perception.table_outline import TableOutline
 from stages.simulate.surface_contacts import AddedContacts, add_contacts, largest_of_groups
 
-ON_EDGE = 1e-9  # of the other edges, up to which a point is on the table [units of the simulation]
+ON_EDGE = 1e-9  # distance beyond an edge up to which a point still counts as on the table [simulation units]
 
 
 class TableEdges:
-    """Changes the contacts of the bodies 1.. of a MuJoCo model with the floor, its first geometry."""
+    """Replaces contacts between the floor, the first geometry of a MuJoCo model, and the bodies from 1 on."""
 
     def __init__(self, mujoco, model, data, outline: TableOutline, corners: Sequence[np.ndarray]):
-        """`outline` is in units of the simulation; `corners` (v, 3) of each body are in its frame."""
+        """`outline` in simulation units; `corners` (v, 3) of the hull of each body in its frame."""
         self._mujoco, self._model, self._outline = mujoco, model, outline
         self._hulls = [_hull_edges(points) for points in corners]
         self._radius = np.array([np.linalg.norm(points, axis=1).max(initial=0) for points in corners])
@@ -30,12 +30,15 @@ class TableEdges:
         self._floor = float(model.geom_pos[0, 2])
         self._left = np.zeros(model.nbody, bool)
         lowest = [self._heights(data, i).min(initial=np.inf) for i in range(len(corners))]
-        self._sunk = np.maximum(self._floor - np.array(lowest), 0)  # which is no contact
+        self._sunk = np.maximum(self._floor - np.array(lowest), 0)  # initial depth below the floor, allowed
         signature = (model.geom_bodyid[0] << 16) + np.arange(1, len(corners) + 1)
         self._on_table = ~np.isin(signature, model.exclude_signature)
 
     def apply(self, data, fixed: np.ndarray) -> None:
-        """After all contacts were found: exclude and add some; `fixed` masks the bodies that do not move."""
+        """Exclude contacts beyond the edges and add contacts at them, after all other contacts were found.
+
+        `fixed` masks the bodies of the model that do not move.
+        """
         count = len(self._radius)
         centre = data.xpos[1 : count + 1]
         beyond = self._outline.beyond(centre)
@@ -45,7 +48,7 @@ class TableEdges:
         body = self._model.geom_bodyid[contact.geom[rows]].max(1)
         rows = rows[self._left[body] | (self._outline.beyond(contact.pos[rows]) > 0)]
         contact.exclude[rows] = 1
-        contact.efc_address[rows] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        contact.efc_address[rows] = -1  # MuJoCo leaves it undefined if all contacts are excluded
         over = self._on_table & ~self._left[1 : count + 1] & ~fixed[1 : count + 1]
         over &= (np.abs(beyond) < self._radius) & (centre[:, 2] - self._floor < self._radius)
         over = np.flatnonzero(over)
@@ -59,19 +62,20 @@ class TableEdges:
         add_contacts(self._mujoco, self._model, data, AddedContacts(x, up, depth, geoms))
 
     def _heights(self, data, row: int) -> np.ndarray:
-        """Those (v,) of the corners of a body's hull."""
+        """Heights (v,) of the corners of a body's hull."""
         return self._hulls[row][0] @ data.xmat[row + 1, 6:] + data.xpos[row + 1, 2]
 
     def _low(self, data, row: int) -> np.ndarray:
-        """Ends (e, 2, 3) of those edges of a body's hull that can touch the floor."""
+        """End points (e, 2, 3) of the edges of a body's hull that reach below the floor."""
         corners, edges = self._hulls[row]
         low = self._heights(data, row) < self._floor - self._sunk[row]
         edges = edges[low[edges].any(1)] if low.any() else edges[:0]
         return corners[edges] @ data.xmat[row + 1].reshape(3, 3).T + data.xpos[row + 1]
 
     def _on_edges(self, ends: np.ndarray, sunk: float) -> np.ndarray:
-        """The outermost points (n, 3) at which edges (e, 2, 3) of a body cross edges of the table at a depth above
-        `sunk`.
+        """Contact points (n, 3) where edges (e, 2, 3) of a body cross edges of the table, deeper than `sunk`.
+
+        For each edge of the table only the two outermost points and the deepest one are kept.
         """
         if not len(ends):
             return ends[:, 0]
@@ -86,7 +90,7 @@ class TableEdges:
 
 
 def _hull_edges(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (v, 3) of the triangulated convex hull of points, and its edges (e, 2); none of points in a plane."""
+    """Corners (v, 3) and edges (e, 2) of the triangulated convex hull of points; none for coplanar points."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):

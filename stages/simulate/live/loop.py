@@ -1,4 +1,4 @@
-"""`ngff simulate scene.ply --live`: the engine in real time, a page that shows it, and the recording."""
+"""`ngff simulate scene.ply --live`: runs the engine in real time, shows it on a page and records it."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 
 log = logging.getLogger(__name__)
-ENDLESS = 10**9  # frames
-FLUSH_TIME = 1.0  # between writes of the recording to the disk [s]
-RATE_TIME = 1.0  # over which the rate is measured [s]
-IDLE_TIME = 0.1  # between frames sent while nothing moves [s]
-MAX_LAG = 0.25  # behind the clock, which is then set back: time passes more slowly instead of in jumps [s]
+ENDLESS = 10**9  # number of frames asked of the engine
+FLUSH_TIME = 1.0  # time between writes of the recording to the disk [s]
+RATE_TIME = 1.0  # time over which the frame rate is measured [s]
+IDLE_TIME = 0.1  # longest time between frames sent to the page, also while paused [s]
+MAX_LAG = 0.25  # largest lag behind real time; beyond it simulated time runs more slowly instead of in jumps [s]
 
 
 @dataclass(frozen=True)
 class LiveScene:
-    """A scene that is ready to be simulated."""
+    """A scene that is ready to be simulated, with its engine."""
 
     world: Scene
     keypoints: Keypoints
@@ -51,10 +51,10 @@ class LiveScene:
 
 
 def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.Event | None = None) -> None:
-    """Simulate until Ctrl-C (or `stop`) and write what was recorded since the last start.
+    """Simulate until Ctrl-C (or `stop`), and write the frames since the last start to `out`.
 
-    Raises InputError for unusable options and where the engine fails at the start, and MissingPackage without
-    websockets.
+    Raises InputError for unusable options and if the engine fails in the first frame, and MissingPackage without the
+    package websockets.
     """
     stop = _stop_on_signals() if stop is None else stop
     setup = set_up_scene(scene.world, scene.prompts, scene.options)
@@ -74,7 +74,7 @@ def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.
 
 
 class _Live:
-    """The state between turns of the loop."""
+    """The state of a session between iterations of its loop."""
 
     def __init__(self, scene: LiveScene, setup: SceneSetup, server: LiveServer, writer: TrajectoryWriter, out: Path):
         self.scene, self.setup, self.server, self.writer, self.out = scene, setup, server, writer, out
@@ -83,7 +83,7 @@ class _Live:
         self.start()
 
     def start(self) -> None:
-        """Begin again at the start, with a new recording."""
+        """Start or restart the simulation, with a new recording."""
         self.session = _session(self.scene, self.setup)
         endless = replace(self.scene.options, steps=ENDLESS)
         self.states: Iterator[FrameState] = self.scene.rollout(
@@ -95,7 +95,7 @@ class _Live:
         self.advance()
 
     def turn(self) -> None:
-        """Take messages, advance when it is time, show and write."""
+        """One iteration of the loop: handle messages, advance if a frame is due, send frames and write."""
         now = time.monotonic()
         for message in self.server.messages(wait=IDLE_TIME if self.paused else max(0.0, self.due - now)):
             self.take(message)
@@ -110,7 +110,7 @@ class _Live:
             self.flushed = now
 
     def take(self, message: dict) -> None:
-        """A message about time and the recording; the others are the session's."""
+        """Handle messages about time and the recording; pass the others to the session."""
         match message["do"]:
             case "pause":
                 self.paused, self.due = message["value"], time.monotonic()
@@ -128,19 +128,19 @@ class _Live:
                 self.session.handle(message)
 
     def advance(self) -> None:
-        """One frame; where the engine fails, pause with a note, as only a new start helps.
+        """Advance by one frame; if the engine fails, pause with a note, since only a restart helps.
 
-        Raises InputError where it fails at the start.
+        Raises InputError if the engine fails in the first frame.
         """
         try:
             state = next(self.states)
         except InputError as error:
-            if self.session.state is None:  # nothing to show yet
+            if self.session.state is None:  # there is no frame to show
                 raise
             log.warning("%s", error)
             self.note, self.paused = f"{error} Start again with R.", True
             return self.show()
-        except StopIteration:  # after an error
+        except StopIteration:  # the engine has failed before
             return self.show()
         self.session.observe(state)
         self.writer.append(state.positions, state.com, state.rotation)
@@ -151,9 +151,9 @@ class _Live:
         self.show()
 
     def save(self) -> None:
-        """A copy of the recording so far, beside the file that is written at the end: traj-1.h5, traj-2.h5, ...
+        """Save a copy of the recording so far next to the output file: traj-1.h5, traj-2.h5, ...
 
-        Where it cannot be written, as on a full disk, a note says so and the session goes on.
+        If it cannot be written, for example on a full disk, a note says so and the session goes on.
         """
         numbered = (self.out.with_name(f"{self.out.stem}-{i}{self.out.suffix}") for i in itertools.count(1))
         path = next(p for p in numbered if not p.exists())
@@ -169,7 +169,7 @@ class _Live:
         log.info("saved %s", self.note)
 
     def show(self) -> None:
-        """Send the present frame: length of the header (uint32), the header (JSON), padding to 4 bytes, float32."""
+        """Send the present frame: length of the header (uint32), header (JSON, 4-byte padding), keypoints (float32)."""
         session = self.session
         self.shown = time.monotonic()
         span = self.turns[-1][0] - self.turns[0][0] if len(self.turns) > 1 else 0.0
@@ -186,7 +186,7 @@ class _Live:
 
 
 def _page(scene: LiveScene, binding, setup: SceneSetup, out: Path) -> str:
-    """The page of the session; the keypoints of its film are at rest."""
+    """The HTML page of the session; its film has a single frame, with the keypoints at rest."""
     world, rest = scene.world, scene.keypoints.rest
     count = len(world.objects)
     motion = Motion(
@@ -212,7 +212,7 @@ def _session(scene: LiveScene, setup: SceneSetup) -> Session:
 
 
 def _stop_on_signals() -> threading.Event:
-    """An event that Ctrl-C and SIGTERM set; a second Ctrl-C interrupts."""
+    """An event that is set by Ctrl-C and SIGTERM; a second Ctrl-C interrupts."""
     stop = threading.Event()
 
     def end(number, _frame) -> None:

@@ -1,4 +1,4 @@
-"""Messages that the page may send to a live session: one table; everything else is refused."""
+"""Messages that the page may send to a live session; all others are rejected."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 from stages.core.physics.materials import ELASTIC
 
-MAX_BYTES = 2048  # of a message
-MAX_LENGTH = 1e4  # of coordinates [scene units]
+MAX_BYTES = 2048  # largest size of a message
+MAX_LENGTH = 1e4  # largest absolute coordinate [scene units]
 
 
 class BadMessage(ValueError):
-    """A message that is not in the table."""
+    """A message that MESSAGES does not allow."""
 
 
 def _number(low: float, high: float) -> Callable[[Any], float]:
@@ -60,27 +60,27 @@ def _material(value: Any) -> str:
 
 
 MESSAGES: dict[str, dict[str, Callable[[Any], Any]]] = {  # name -> its fields with their checks
-    "grab": {"object": _object, "point": _vector, "target": _vector},  # a point of an object, pulled to the target
-    "move": {"target": _vector},  # of what is grabbed
+    "grab": {"object": _object, "point": _vector, "target": _vector},  # pull a point of an object to the target
+    "move": {"target": _vector},  # move the target of the grabbed point
     "release": {},
     "push": {"object": _object, "point": _vector, "direction": _direction, "strength": _number(0, 100)},  # [units/s]
-    "lift": {"object": _object, "height": _number(-100, 100)},  # hold it higher by this [scene units]
+    "lift": {"object": _object, "height": _number(-100, 100)},  # raise and hold it [scene units]
     "drop": {"object": _object},
     "pin": {"object": _object, "value": _flag},
     "gravity": {"value": _number(-100, 100)},  # downwards [m/s^2]
     "friction": {"value": _number(0, 10)},
     "material": {"object": _object, "name": _material},
     "pause": {"value": _flag},
-    "step": {},  # one frame, while paused
-    "speed": {"value": _number(0.01, 4)},  # of the motion, relative to real time
-    "reset": {},  # to the start; a new recording
+    "step": {},  # advance by one frame while paused
+    "speed": {"value": _number(0.01, 4)},  # of simulated time, relative to real time
+    "reset": {},  # restart with a new recording
     "save": {},
     "drawn": {},  # the last frame has been drawn; the next may be sent
 }
 
 
 def parse_message(text: str | bytes) -> dict[str, Any]:
-    """A message as {"do": name, ...fields}. Raises BadMessage."""
+    """Parse a message to {"do": name, ...fields}. Raises BadMessage."""
     if not isinstance(text, str) or len(text) > MAX_BYTES:
         raise BadMessage("a short text is expected")
     try:

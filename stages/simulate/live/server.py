@@ -1,8 +1,9 @@
-"""The local server of a live session: the page, and a WebSocket for messages and frames.
+"""The local server of a live session, which serves the page and exchanges messages and frames over a WebSocket.
 
 It listens on 127.0.0.1 only. The address has a random token; requests with another host, path or origin are refused.
-One client controls, the first; any others watch, and the one connected longest takes over when it leaves. A frame is
-sent to a client when it has drawn the one before, so that none falls behind. It runs in a thread of its own.
+The first client controls the session and others watch; when it leaves, the client connected longest takes over. A
+client gets a new frame only after it has drawn the previous one, so that none falls behind. The server runs in a thread
+of its own.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from stages.simulate.live.messages import MAX_BYTES, BadMessage, parse_message
 log = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MAX_CLIENTS = 16
-MAX_ERRORS = 10  # wrong messages after which a client is disconnected
-MAX_RATE = 500  # messages per second of one client
-MAX_WAITING = 1000  # messages that the engine has not read; older ones are dropped
-HANDSHAKE_TIME = 5.0  # after which a connection that asks for nothing is closed [s]
+MAX_ERRORS = 10  # invalid messages after which a client is disconnected
+MAX_RATE = 500  # most messages per second from a client; beyond, it is disconnected
+MAX_WAITING = 1000  # most messages that wait for the engine; older ones are dropped
+HANDSHAKE_TIME = 5.0  # time after which a connection without a request is closed [s]
 
 
 @dataclass(eq=False)
@@ -37,15 +38,18 @@ class Client:
     """A connected page."""
 
     socket: object
-    ready: bool = False  # has drawn what it was sent
-    sent: int = -1  # number of the last frame it was sent
-    errors: int = 0
-    second: int = 0  # in which its messages are being counted
-    count: int = 0
+    ready: bool = False  # has drawn the last frame that was sent to it
+    sent: int = -1  # number of the last frame that was sent to it
+    errors: int = 0  # invalid messages so far
+    second: int = 0  # second of the clock to which `count` refers
+    count: int = 0  # messages received in this second
 
 
 class LiveServer:
-    """Context manager; inside, `url` serves the page, `messages` are those of the controlling client."""
+    """Context manager that serves `page` at `url`.
+
+    Raises InputError if it cannot listen on the port (0: any free one), and MissingPackage without websockets.
+    """
 
     def __init__(self, page: str, port: int = 0):
         try:
@@ -64,7 +68,7 @@ class LiveServer:
         self._frame, self._number = b"", -1
         self._arrived = threading.Event()
         self._loop = asyncio.new_event_loop()
-        # more connections than this process may have files open are tracebacks of asyncio else; they are accepted later
+        # asyncio would print a traceback for connections beyond the limit of open files, which it accepts later
         self._loop.set_exception_handler(lambda _, context: log.debug("%s", context["message"]))
         self._thread = threading.Thread(target=self._run, name="live server", daemon=True)
 
@@ -79,17 +83,17 @@ class LiveServer:
         self._thread.join(timeout=5)
 
     def messages(self, wait: float = 0.0) -> list[dict]:
-        """Messages of the controlling client since the last call; waits up to `wait` [s] for one."""
+        """Messages of the controlling client since the last call; waits up to `wait` [s] for the first."""
         if wait:
             self._arrived.wait(wait)
         self._arrived.clear()
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
     def publish(self, frame: bytes) -> None:
-        """Send a frame to all clients that are ready for it; the others get the newest when they are."""
+        """Send a frame to all clients that are ready; the others get the newest frame once they are ready."""
         self._loop.call_soon_threadsafe(self._publish, frame)
 
-    # --- in the thread of the server ---
+    # --- the methods below run in the thread of the server ---
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -112,7 +116,7 @@ class LiveServer:
             await self._stop.wait()
 
     def _answer(self, connection, request):
-        """The page, or an error; None lets the handshake of a WebSocket go on."""
+        """Response to an HTTP request: the page or an error; None to continue the handshake of a WebSocket."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
@@ -136,7 +140,7 @@ class LiveServer:
         from websockets.exceptions import ConnectionClosed
 
         client = Client(connection)
-        if len(self._clients) >= MAX_CLIENTS:  # several handshakes at once
+        if len(self._clients) >= MAX_CLIENTS:  # after simultaneous handshakes
             return
         self._clients.append(client)
         self._tell_roles()
@@ -150,13 +154,13 @@ class LiveServer:
         finally:
             controlled = self._clients[0] is client
             if controlled:
-                self._put({"do": "release"})  # a drag ends with the client that made it
+                self._put({"do": "release"})  # end its drag
             self._clients.remove(client)
             if controlled:
                 self._tell_roles()
 
     def _receive(self, client: Client, text: str | bytes) -> bool:
-        """Take a message; False when the client is to be disconnected."""
+        """Handle a message; returns False if the client is to be disconnected."""
         second = int(time.monotonic())
         client.count = client.count + 1 if second == client.second else 1
         client.second = second

@@ -1,4 +1,4 @@
-"""A user's actions as force prompts, one frame at a time, and their record."""
+"""Conversion of a user's actions to force prompts, frame by frame, and their recording."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.trajectory import Keypoints
 
 SPRING = 7.0  # angular frequency of the spring from a grabbed point to the cursor [1/s]
-DAMPING = 0.8  # of critical
-MAX_ACCELERATION = 60.0  # by a spring [m/s^2]
-MARGIN = 0.01  # of a frame at both ends in which its forces do not act, so that rounding moves none to another frame
-MAX_PUSHES = 3  # in one frame
-ARROW_TIME = 0.4  # for which the arrow of a push is shown [s]
+DAMPING = 0.8  # damping ratio of the spring
+MAX_ACCELERATION = 60.0  # largest acceleration by the spring [m/s^2]
+MARGIN = 0.01  # part of a frame at both ends without forces, so that rounding does not move forces to another frame
+MAX_PUSHES = 3  # most pushes per frame
+ARROW_TIME = 0.4  # time for which the arrow of a push is shown [s]
 PUSH_ARROW = 0.25  # length of the arrow of a push of 1 scene unit per second [scene units]
 
 Vector = tuple[float, float, float]
@@ -32,7 +32,7 @@ class LivePrompts(ForcePrompts):
     session: Session | None = None
 
     def during(self, start: float, end: float) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
-        """What the user does in the frame from `start` to `end` [s]."""
+        """Forces and changes in the frame from `start` to `end` [s], with those of the user."""
         forces, changes = super().during(start, end)
         return self.session.during(start, end, forces, changes)
 
@@ -41,23 +41,24 @@ class LivePrompts(ForcePrompts):
 class Session:
     """What the user holds, pushes and changes.
 
-    Messages are those of `messages.py`. `observe` is given every frame before the engine asks for what acts next.
+    Messages are those of `messages.py`. `observe` must be called with every frame before the engine asks for the forces
+    of the next one.
     """
 
-    given: ForcePrompts  # of the command line
+    given: ForcePrompts  # prompts of the command line
     keypoints: Keypoints
-    ids: list[int]  # of the objects, in the order of the scene, as rows of the states
+    ids: list[int]  # ids of the objects, in the order of the scene and of the rows of states
     gravity: float  # downwards [m/s^2]
-    unit: float = 1.0  # [m per scene unit]
-    low: Vector = (-math.inf,) * 3  # room in which objects are pulled [scene units]
-    high: Vector = (math.inf,) * 3
+    unit: float = 1.0  # metres per scene unit
+    low: Vector = (-math.inf,) * 3  # lower corner of the region in which targets may be [scene units]
+    high: Vector = (math.inf,) * 3  # upper corner of that region
 
-    record: list[dict] = field(default_factory=list)  # prompts that repeat what was done, as ForcePrompts.as_dicts
-    arrows: list[tuple[Vector, Vector]] = field(default_factory=list)  # of the forces of the last frame
-    dragged: tuple[int, int] | None = None  # object and keypoint
-    target: Float[Tensor, "3"] | None = None  # of the dragged keypoint
-    lifted: dict[int, Float[Tensor, "3"]] = field(default_factory=dict)  # object -> where its centre of mass is held
-    pinned: set[int] = field(default_factory=set)
+    record: list[dict] = field(default_factory=list)  # prompts that repeat the session, as of ForcePrompts.as_dicts
+    arrows: list[tuple[Vector, Vector]] = field(default_factory=list)  # tail and tip, of the forces of the last frame
+    dragged: tuple[int, int] | None = None  # id of the object and row of the keypoint
+    target: Float[Tensor, "3"] | None = None  # position to which the dragged keypoint is pulled
+    lifted: dict[int, Float[Tensor, "3"]] = field(default_factory=dict)  # id -> where the centre of mass is held
+    pinned: set[int] = field(default_factory=set)  # ids of the pinned objects
 
     def __post_init__(self):
         self.pinned, self.record = set(self.given.pinned), list(self.given.as_dicts())
@@ -68,21 +69,21 @@ class Session:
         self.state: FrameState | None = None
 
     def prompts(self) -> LivePrompts:
-        """The prompts for the engine, with room for the forces of a frame."""
-        most = len(self.ids) + 2 + MAX_PUSHES  # a lift of each object, a drag and its weight, pushes
+        """The prompts for the engine, with slots for the forces of a frame."""
+        most = len(self.ids) + 2 + MAX_PUSHES  # a lift per object, a drag and its weight, pushes
         room = [Force(self.ids[0], start=0.0, end=0.0)] * most
         given = {name: getattr(self.given, name) for name in ("pinned", "velocity", "lift", "changes")}
         return LivePrompts((*self.given.forces, *room), **given, session=self)
 
     def observe(self, state: FrameState) -> None:
-        """The present frame. Raises InputError for engines that do not tell the masses of the objects."""
+        """Take the present frame. Raises InputError if the engine does not provide the masses of the objects."""
         if state.mass is None:
             raise InputError("--live: this engine does not tell the masses of the objects (FrameState.mass)")
         self._before = None if self.state is None else self.state
         self.state = state
 
     def handle(self, message: dict) -> None:
-        """Take a message about the objects; those about unknown objects have no effect."""
+        """Handle a message about the objects; messages about unknown objects have no effect."""
         id = message.get("object")
         if self.state is None or (id is not None and id not in self.ids):
             return
@@ -112,7 +113,7 @@ class Session:
     def during(
         self, start: float, end: float, forces: tuple[Force, ...], changes: tuple[Change, ...]
     ) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
-        """The given forces and changes with those of the user in a frame; they are recorded."""
+        """The given forces and changes of a frame with those of the user, which are recorded."""
         new = [replace(change, start=start) for change in self._pending]
         for change in (*changes, *new):
             self.gravity = change.value if change.what == "gravity" else self.gravity
@@ -126,13 +127,13 @@ class Session:
         return (*self.given.forces, *acting), (*changes, *new)
 
     def _change(self, what: str, value: float | str | bool, object_id: int | None = None) -> None:
-        """Take effect with the next frame, instead of the same change of the same object."""
+        """Schedule a change for the next frame; it replaces an earlier one of the same quantity and object."""
         same = (what, object_id)
         self._pending = [c for c in self._pending if (c.what, c.object_id) != same]
         self._pending.append(Change(what, value, 0.0, object_id))
 
     def _actions(self, dt: float, start: float) -> list[tuple[int, Tensor, int | None]]:
-        """Object, acceleration [m/s^2] and keypoint (None: the whole object) of what the user does, and the arrows."""
+        """The user's actions: object id, acceleration [m/s^2], keypoint (None: the whole object). Sets `arrows`."""
         actions: list[tuple[int, Tensor, int | None]] = []
         self.arrows = []
         if self.dragged is not None and self.dragged[0] not in self.pinned:
@@ -158,7 +159,7 @@ class Session:
         return actions
 
     def _spring(self, here: Tensor, before: Tensor | None, target: Tensor, dt: float) -> Float[Tensor, "3"]:
-        """Acceleration [m/s^2] of a damped spring to the target."""
+        """Acceleration [m/s^2] by a damped spring from `here` to the target, limited to MAX_ACCELERATION."""
         target = target.maximum(torch.tensor(self.low)).minimum(torch.tensor(self.high))
         velocity = torch.zeros(3) if before is None else (here - before) / dt
         pull = self.unit * (SPRING**2 * (target - here) - 2 * DAMPING * SPRING * velocity)
@@ -174,7 +175,7 @@ class Session:
         return Force(id, _vector(newtons), start=start, end=end, at=at)
 
     def _nearest(self, id: int, point: Vector) -> int:
-        """The keypoint of an object nearest to a point."""
+        """Row of the keypoint of an object that is nearest to a point."""
         distance = (self.state.positions - torch.tensor(point)).norm(dim=1)
         return int(torch.where(self.keypoints.object_id == id, distance, math.inf).argmin())
 

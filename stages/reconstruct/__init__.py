@@ -1,1 +1,1 @@
-"""Photos to scene.ply."""
+"""Reconstruction: photos -> scene.ply."""

@@ -12,12 +12,12 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.scene.cameras import Cameras
 
-MAX_GAP = 60.0  # of the azimuth between neighbouring photos [degrees]
-PHOTO_SPACING = 15.0  # recommended between neighbouring photos [degrees]
-FEW_PHOTOS = 10  # photos
+MAX_GAP = 60.0  # largest azimuth difference between neighbouring photos without advice [degrees]
+PHOTO_SPACING = 15.0  # recommended azimuth difference between neighbouring photos [degrees]
+FEW_PHOTOS = 10  # number of photos below which more are recommended
 MIN_CONSISTENT = 0.35  # mean fraction of pixels with consistent depth; lower for plain, shiny or transparent surfaces
-MIN_SHARPNESS = 0.2  # relative to the median
-MAX_REASONS, MAX_NAMED = 5, 3  # reported reasons for dropped photos, and photos named for each
+MIN_SHARPNESS = 0.2  # sharpness below which a photo counts as blurred, relative to the median
+MAX_REASONS, MAX_NAMED = 5, 3  # most reasons for dropped photos that are reported, and photos named for each
 
 
 def advise(
@@ -28,7 +28,7 @@ def advise(
     supported: bool,
     dropped: dict[str, str],
 ) -> list[str]:
-    """Sentences, the most useful first; empty for a good photo set. World: z up.
+    """Sentences of advice, most useful first; empty for a good photo set. The world has z up.
 
     `consistent`: fraction of the pixels of each photo with consistent depth; `supported`: a supporting plane was found;
     `dropped`: photos left out -> reason.
@@ -55,7 +55,7 @@ def advise(
 
 
 def _left_out(dropped: dict[str, str]) -> list[str]:
-    """One sentence for each reason, with its photos."""
+    """One sentence for each reason why photos were left out, with the photos."""
     photos = defaultdict(list)
     for name, why in dropped.items():
         photos[why].append(name)
@@ -71,7 +71,7 @@ def _left_out(dropped: dict[str, str]) -> list[str]:
 
 
 def _around(cameras: Cameras, focus: Float[Tensor, "3"]) -> list[str]:
-    """Advice on the widest gap, if it is too wide."""
+    """Advice on the widest azimuth gap between photos, if it is too wide."""
     gap, before, after = widest_gap(cameras, focus)
     if gap <= MAX_GAP:
         return []
@@ -83,7 +83,7 @@ def _around(cameras: Cameras, focus: Float[Tensor, "3"]) -> list[str]:
 
 
 def widest_gap(cameras: Cameras, focus: Float[Tensor, "3"]) -> tuple[float, str, str]:
-    """The largest azimuth gap between cameras around the vertical through the focus.
+    """Find the widest azimuth gap between cameras around the vertical through the focus.
 
     Returns its angle [degrees] and the photos at its ends, counter-clockwise as seen from above.
     """

@@ -1,4 +1,4 @@
-"""The steps after cameras and depth, common to all backends: Gaussians, world frame, photometric fit, scale, advice."""
+"""The steps after cameras and depth, which all backends share: Gaussians, world frame, fit, scale and advice."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from stages.reconstruct.step_cache import StepCache
 from stages.reconstruct.world_frame import Ground
 
 log = logging.getLogger(__name__)
-MIN_DEPTH_SAMPLES = 1000  # consistent depth samples that a scene needs
-FAR_DEPTH = 3.0  # depth of pixels without a known one [camera distances]
+MIN_DEPTH_SAMPLES = 1000  # fewest consistent depth samples of a scene
+FAR_DEPTH = 3.0  # depth of pixels whose depth is unknown [camera distances]
 MAX_SCENE_DISTANCE = 10.0  # Gaussians farther from the focus are dropped [camera distances]
 
 
@@ -38,21 +38,21 @@ class SceneGeometry:
 
     source: Path  # of the photos, for error messages
     views: Views
-    trained: list[int]  # views that the Gaussians are fitted to
-    held_out: list[int]
-    maps: list[DepthMap]  # of the views in `trained`
-    min_support: int  # views that have to agree with a depth
+    trained: list[int]  # views to which the Gaussians are fitted
+    held_out: list[int]  # views that are kept out of the fit
+    maps: list[DepthMap]  # depth maps of the views in `trained`
+    min_support: int  # smallest support of a consistent depth, see DepthMap
     focus: Float[Tensor, "3"]  # the point that the cameras look at
-    radius: float  # their median distance from it
-    gaussians: Gaussians | None = None  # predicted by a network; otherwise they start from the depth maps
+    radius: float  # median distance of the cameras from `focus`
+    gaussians: Gaussians | None = None  # predicted by a network; None: made from the depth maps
     dropped: dict[str, str] = field(default_factory=dict)  # photos left out -> reason
 
 
 def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCache, device: str) -> Reconstruction:
-    """The scene in the world frame: z up, camera distance about 1 unless cameras were given.
+    """Build the scene in the world frame: z up, camera distance about 1 unless cameras were given.
 
-    The supporting plane is z = 0; without one, z = 0 is at the lowest points and the scene has no floor.
-    Raises InputError where too little depth is consistent or the scale reference does not fit the photos.
+    The supporting plane is z = 0; without one, z = 0 is at the lowest points and the scene has no floor. Raises
+    InputError if too little depth is consistent or the scale reference does not fit the photos.
     """
     observed = DepthViews(found.views[found.trained], found.maps, found.min_support)
     reference = parse_scale(options.scale_reference)
@@ -89,7 +89,7 @@ def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCa
 def _fused_points(
     observed: DepthViews, found: SceneGeometry, options: ReconstructOptions, device: str
 ) -> OrientedPoints:
-    """Points of the consistent depth, as many as the quality preset has Gaussians."""
+    """Points of consistent depth, about as many as the quality preset has Gaussians."""
     cloud = initialise.fuse(observed.to(device)).to("cpu")
     if len(cloud) < MIN_DEPTH_SAMPLES:
         raise InputError(f"{found.source}: depth is consistent at too few points ({len(cloud)}); give more, sharper "
@@ -123,7 +123,7 @@ def unmatched_gaussians(
 
 
 def mean_colour(views: Views) -> tuple[float, float, float]:
-    """Mean RGB of all photos, the colour of pixels without Gaussians."""
+    """Mean RGB of all photos, for pixels without Gaussians."""
     means = [views.image(i).mean((0, 1)) for i in range(len(views))]
     red, green, blue = torch.stack(means).mean(0).tolist()
     return red, green, blue
@@ -136,7 +136,7 @@ def _known_depth(observed: DepthViews, i: int, scale: float) -> Float[Tensor, "h
 
 
 def _provenance(to_world: Similarity, ground: Ground) -> dict:
-    """Facts stored in the provenance of the scene."""
+    """The transform to the world frame and whether there is a plane, for the provenance of the scene."""
     similarity = {
         "scale": to_world.scale, "rotation": to_world.rotation.tolist(), "translation": to_world.translation.tolist(),
     }  # fmt: skip

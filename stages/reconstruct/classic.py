@@ -1,4 +1,4 @@
-"""The classic backend: structure from motion, multi-view stereo, then Gaussians fitted to the photos."""
+"""The classic backend: structure from motion, multi-view stereo, and Gaussians fitted to the photos."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def reconstruct(photos: Photos, options: ReconstructOptions, steps: StepCache) -
 def reconstruct_from_model(
     photos: Photos, model: sfm.SparseModel, options: ReconstructOptions, steps: StepCache, device: str
 ) -> Reconstruction:
-    """The steps after structure from motion; the model has a camera for each photo."""
+    """Run the steps after structure from motion; the model has a camera for each photo."""
     views = undistort(photos, model.cameras, model.lenses, options.max_side)
     focus = world_frame.focus_point(model.cameras.viewmats, _typical_depths(model))
     ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed, options.up)
@@ -49,7 +49,7 @@ def reconstruct_from_model(
 def _cameras(
     photos: Photos, options: ReconstructOptions, device: str, steps: StepCache
 ) -> tuple[sfm.SparseModel, Photos]:
-    """Cameras and sparse points: estimated, or triangulated with the given cameras; and the photos that have one."""
+    """Cameras and sparse points, estimated or triangulated with given cameras; and the photos that have a camera."""
     matching = MatchingOptions(options.matcher, options.seed, device)
     if options.cameras is None:
         return sfm.estimate_cameras(photos, matching, steps), photos
@@ -70,7 +70,7 @@ def _cameras(
 
 
 def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:
-    """The cameras with K in pixels of the loaded photos, which may be smaller than the files."""
+    """Scale K to pixels of the loaded photos, which may be smaller than the files."""
     sizes = torch.tensor([photos.size(i) for i in range(len(photos))])
     ratio = sizes / cameras.sizes
     Ks = torch.stack([resize(K, float(sx), float(sy)) for K, (sx, sy) in zip(cameras.Ks, ratio, strict=True)])

@@ -1,6 +1,6 @@
-"""COLMAP through the package pycolmap, its long steps in a process of their own (colmap_worker.py).
+"""Access to COLMAP by the package pycolmap; long steps run in a separate process (colmap_worker.py).
 
-Where memory or disk space runs out, a thread of COLMAP's aborts its process: that ends the step with one error.
+If memory or disk space runs out, a thread of COLMAP aborts its process. In a separate process this is only an error.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ from typing import NamedTuple
 from stages.core.errors import InputError
 
 WORKER = "import sys; sys.path[:] = sys.argv[1:]; from stages.reconstruct.colmap_worker import main; main()"
-_open: list[subprocess.Popen] = []  # the process of the context, if any
+_open: list[subprocess.Popen] = []  # process of the current `colmap_process` context, if any
 
 
 def import_pycolmap() -> ModuleType:
-    """The package; ImportError where it is absent. It prints a stack trace at SIGTERM otherwise."""
+    """Import pycolmap and restore the SIGTERM handler, which pycolmap replaces by one that prints a stack trace.
+
+    Raises ImportError if the package is absent.
+    """
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
@@ -35,7 +38,7 @@ def import_pycolmap() -> ModuleType:
 
 @contextmanager
 def colmap_process() -> Iterator[subprocess.Popen]:
-    """Context, or decorator, with a process for `run_colmap`; within another such context its process."""
+    """Context manager or decorator that provides a process for `run_colmap`; nested contexts share one process."""
     if _open:
         yield _open[0]
         return
@@ -59,7 +62,7 @@ def _started() -> Iterator[subprocess.Popen]:
 
 
 class SecondProcess(NamedTuple):
-    """A process for tasks beside those of `colmap_process`, and the thread that waits for them."""
+    """A process for tasks in parallel to those of `colmap_process`, and the thread that waits for it."""
 
     thread: ThreadPoolExecutor
     process: subprocess.Popen
@@ -67,7 +70,7 @@ class SecondProcess(NamedTuple):
 
 @contextmanager
 def second_process() -> Iterator[SecondProcess]:
-    """Context with a second process, which needs a second to start; it ends with the context, and so does its task."""
+    """Context manager with a second process, which takes a second to start; its task ends with the context."""
     with ThreadPoolExecutor(1) as thread, _started() as process:
         yield SecondProcess(thread, process)
 
@@ -76,10 +79,11 @@ def run_colmap(
     task: str, folder: Path, progress: Callable[[int], object] | None = None, process: subprocess.Popen | None = None,
     **arguments: object,
 ) -> None:  # fmt: skip
-    """Run a task of colmap_worker.TASKS, with arguments that JSON can hold, which writes its results to `folder`.
+    """Run a task of colmap_worker.TASKS with JSON-serialisable arguments; it writes its results to `folder`.
 
-    It runs in `process`, or else in that of `colmap_process`. `progress` is called with the number of photos that are
-    done. Raises RuntimeError where COLMAP fails, MemoryError, and InputError where its process ends.
+    It runs in `process`, or in that of `colmap_process` if none is given. `progress` is called with the number of newly
+    finished photos. Raises RuntimeError if COLMAP fails, MemoryError if it runs out of memory, and InputError if its
+    process ends.
     """
     with nullcontext(process) if process else colmap_process() as process:
         try:

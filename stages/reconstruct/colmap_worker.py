@@ -1,8 +1,8 @@
 """The process that runs COLMAP's long steps for colmap.py.
 
-It reads requests from stdin, one in a line: [task, arguments] in JSON. To each it writes lines to stdout: ["progress",
-number of photos] as often as needed, then ["done", null] or ["error", text]. It ends with its stdin, as when the
-process that started it has been killed.
+It reads requests from stdin, one JSON array [task, arguments] per line. For each request it writes lines to stdout: any
+number of ["progress", number of photos], then ["done", null] or ["error", text]. It exits at the end of stdin, also
+when the parent process has been killed.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from pathlib import Path
 from stages.reconstruct.colmap import import_pycolmap
 
 Progress = Callable[[int], None]
-MIN_SHARING = 10  # photos of a camera whose principal point is refined
-MIN_GAIN = 0.03  # of the reprojection error: 0 to .012 in four sets of whole photos, .01, .07, .12 in cropped ones
+MIN_SHARING = 10  # fewest photos of a camera whose principal point is refined
+# Smallest relative gain in reprojection error by refined principal points: measured 0 to .012 in four sets of whole
+# photos, and .01, .07 and .12 in cropped ones.
+MIN_GAIN = 0.03
 
 
 def extract_features(progress: Progress, folder: str, names: list[str], threads: int) -> None:
@@ -36,8 +38,8 @@ def extract_features(progress: Progress, folder: str, names: list[str], threads:
 def map_photos(progress: Progress, folder: str, database: str, photos: int, seed: int) -> None:
     """Write the models that COLMAP's incremental mapper finds to the folders 0, 1, ... in `folder`.
 
-    Principal points are in the middle of the photos, unless others explain the best model distinctly better, as where
-    photos were cropped: then all are mapped again from these. Changes the cameras of the database.
+    Principal points are at the centres of the photos. If refined ones explain the best model clearly better, because
+    photos were cropped, all photos are mapped again with these, and the cameras in the database are changed.
     """
     pycolmap = import_pycolmap()
     options = _mapper_options(photos, seed)
@@ -62,9 +64,10 @@ def map_photos(progress: Progress, folder: str, database: str, photos: int, seed
 
 
 def _off_centre(model) -> list:
-    """The model's cameras with refined principal points, if that lowers its reprojection error by MIN_GAIN.
+    """The model's cameras with refined principal points, if these lower the reprojection error by MIN_GAIN; else empty.
 
-    Few photos tell a principal point from a tilt of the scene only badly: each camera must have MIN_SHARING of them.
+    Each camera must have at least MIN_SHARING photos, since few photos hardly distinguish an offset of the principal
+    point from a tilt of the scene.
     """
     pycolmap = import_pycolmap()
     users = Counter(image.camera_id for image in model.images.values())
@@ -79,7 +82,7 @@ def _off_centre(model) -> list:
 
 
 def triangulate(progress: Progress, folder: str, database: str, photos: int, seed: int) -> None:
-    """Replace the model in `folder`, which has cameras and images, by one with points."""
+    """Triangulate points, and replace the model in `folder`, which has only cameras and images, by one with points."""
     pycolmap = import_pycolmap()
     model = pycolmap.Reconstruction(folder)
     options = _mapper_options(photos, seed)
@@ -87,10 +90,10 @@ def triangulate(progress: Progress, folder: str, database: str, photos: int, see
 
 
 def _mapper_options(photos: int, seed: int):
-    """COLMAP's defaults, on one thread, and without minimum sizes for very few photos."""
+    """COLMAP's defaults on one thread, without minimum model sizes for very few photos."""
     options = import_pycolmap().IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
     options.min_model_size = min(3, photos)
-    options.triangulation.ignore_two_view_tracks = photos > 3  # up to 3 photos have mostly these
+    options.triangulation.ignore_two_view_tracks = photos > 3  # most tracks of up to 3 photos have two views
     return options
 
 
@@ -99,9 +102,9 @@ TASKS = {"extract": extract_features, "map": map_photos, "triangulate": triangul
 
 def main() -> None:
     """Run tasks until stdin ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both; the other process ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # both processes receive Ctrl-C; the parent ends this one
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever COLMAP prints
+    os.dup2(2, 1)  # send everything that COLMAP prints to stderr
 
     def say(kind: str, value: object) -> None:
         out.write(json.dumps([kind, value]) + "\n")

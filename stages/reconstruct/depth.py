@@ -25,13 +25,13 @@ from stages.core.kernels.threads import parallel_map
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 
-MAX_SOURCES = 4  # views matched with each view
-MAX_CHECK_VIEWS = 10  # views that the depth of each view is checked against
+MAX_SOURCES = 4  # source views matched with each view
+MAX_CHECK_VIEWS = 10  # views against which the depth of each view is checked
 MAX_LABELS = 192  # depth hypotheses per pixel
 STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # P1 and P2 of semi-global matching, for costs 0..1
-DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # of consistent depths: relative, and reprojected [px]
-REFINE_STEPS = (0.5, 0.2)  # of the two refinement rounds [steps of the hypothesis grid]
-CPU_PIXELS, CUDA_CHUNK = 1 << 17, 64  # warped at once: pixels that stay in the cache, or hypotheses in few launches
+DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # consistent depths: relative difference, and reprojection error [px]
+REFINE_STEPS = (0.5, 0.2)  # step of each refinement round [steps of the hypothesis grid]
+CPU_PIXELS, CUDA_CHUNK = 1 << 17, 64  # warped at once: pixels that fit in a CPU cache; hypotheses, for few launches
 MOVE_COST = 0.02  # cost added per refinement step away from the current depth
 
 
@@ -44,7 +44,7 @@ class DepthMap:
 
 
 def estimate_depth_maps(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
-    """A depth map of every view, checked against the other views; `plane` is the supporting plane, if known."""
+    """Estimate a depth map of every view and check it against the others; `plane`: the supporting plane, if known."""
     checks = select_sources(model, MAX_CHECK_VIEWS)
     sources = [best[:MAX_SOURCES] for best in checks]
     raw = []
@@ -59,7 +59,7 @@ def estimate_depth_maps(views: Views, model: SparseModel, plane: Plane | None, d
 
 
 def select_sources(model: SparseModel, count: int) -> list[list[int]]:
-    """For every view, up to `count` others with the most common points under a useful angle (best near 10 degrees).
+    """For every view, up to `count` others with most common points at a useful triangulation angle (about 10 degrees).
 
     Score of Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the triangulation angle, narrower below its mean.
     """
@@ -87,7 +87,7 @@ def select_sources(model: SparseModel, count: int) -> list[list[int]]:
 def _match_view(
     views: Views, model: SparseModel, i: int, sources: list[int], plane: Plane | None, device: str
 ) -> Float[Tensor, "h w"]:
-    """Depth of view i before the consistency check: swept at half resolution, refined at full resolution."""
+    """Depth of view i before the consistency check: plane sweep at half resolution, refined at full resolution."""
     half = _Stereo(views, i, sources, 0.5, device)
     low, high = _depth_range(views, model, i)
     labels = half.labels(low, high)
@@ -117,7 +117,7 @@ def _depth_range(views: Views, model: SparseModel, i: int) -> tuple[float, float
 
 
 class _Stereo:
-    """A reference view and its source views at one resolution, to score depth hypotheses."""
+    """Scores depth hypotheses of a reference view by its source views, at one resolution."""
 
     def __init__(self, views: Views, i: int, sources: list[int], scale: float, device: str):
         self.reference, K = _grey(views, i, scale, device)
@@ -134,7 +134,7 @@ class _Stereo:
             self.sources.append((image, rotated, K_j @ motion[:3, 3]))
 
     def labels(self, near: float, far: float) -> Float[Tensor, "d"]:
-        """Inverse depths from far to near, spaced by at most about a pixel in any source (up to MAX_LABELS)."""
+        """Inverse depths from far to near, at most about a pixel apart in any source; up to MAX_LABELS."""
         ends = []
         for _, rotated, shift in self.sources:
             pixel = [(rotated * z + shift[:, None, None]) for z in (near, far)]
@@ -143,9 +143,9 @@ class _Stereo:
         return torch.linspace(1 / far, 1 / near, count, device=self.rays.device)
 
     def cost(self, depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
-        """Cost 0 (equal) to 1 (uncorrelated) of each hypothesis: the mean over the better half of the sources.
+        """Cost of each hypothesis, from 0 (equal) to 1 (uncorrelated): mean over the better half of the sources.
 
-        The point may be occluded in the other half.
+        In the other half the point may be occluded.
         """
 
         def cost_of(part: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
@@ -157,7 +157,7 @@ class _Stereo:
         return torch.cat(parallel_map(cost_of, depth.split(max(1, CPU_PIXELS // depth[0].numel()))))
 
     def _correlation(self, depth, image, rotated, shift) -> Float[Tensor, "d h w"]:
-        """Normalised cross-correlation of windows; 0 where the point is outside the source image."""
+        """Normalised cross-correlation of windows; 0 where a point projects outside the source image."""
         x, y, z = (depth * ray + offset for ray, offset in zip(rotated, shift, strict=True))
         front = z > 0
         z.clamp_min_(1e-6)
@@ -195,7 +195,7 @@ def _grey(views: Views, i: int, scale: float, device: str) -> tuple[Float[Tensor
 
 
 def _box(images: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
-    """Mean over 5 x 5 pixels, edges replicated; shifted sums are ten times as fast as average pooling on a CPU."""
+    """Mean over 5 x 5 pixels with replicated edges; shifted sums are ten times as fast as average pooling on a CPU."""
     padded = F.pad(images[None], (2, 2, 2, 2), mode="replicate")[0]
     pairs = padded[..., :-1] + padded[..., 1:]
     rows = pairs[..., :-3] + pairs[..., 2:-1]
@@ -207,7 +207,7 @@ def _box(images: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
 
 
 def _moments(images: Float[Tensor, "d h w"]) -> tuple[Tensor, Tensor]:
-    """Mean and variance over the window; the variance of 2 grey levels is added, to suppress noise."""
+    """Mean and variance over the window; a variance of (2 grey levels)^2 is added to suppress noise."""
     mean = _box(images)
     return mean, _box(images * images).sub_(mean * mean).clamp_min_(0).add_((2 / 255) ** 2)
 
@@ -217,12 +217,12 @@ def _slanted_cost(
 ) -> Float[Tensor, "d h w"]:
     """Cost of each hypothesis and pixel for a surface parallel to the supporting plane.
 
-    `normal` is that of the plane in camera axes, pointing up, `height` the distance of the camera from it. The sweep
-    covers planes from a little below it to halfway up to the camera and is interpolated at the depth of each label: a
-    plane at h below the camera is at depth h / slope.
+    `normal`: upward normal of the plane in camera axes; `height`: distance of the camera from the plane. The sweep
+    covers planes from slightly below the supporting plane to halfway up to the camera, and is interpolated at the depth
+    of each label: a plane at a distance h below the camera is at depth h / slope.
     """
     slope = -(normal[:, None, None] * stereo.rays).sum(0)
-    facing = slope > 0.1  # not for planes at less than about 6 degrees to the ray
+    facing = slope > 0.1  # excludes rays at less than about 6 degrees to the plane
     if facing.float().mean() < 0.02:
         return torch.ones(len(labels), *stereo.size, device=labels.device)
     slope = slope.clamp_min(0.1)
@@ -239,7 +239,7 @@ def _slanted_cost(
 
 
 def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
-    """The label of each pixel, with subpixel fraction, by semi-global matching along rows and columns."""
+    """The label of each pixel, with a fraction from a parabola, by semi-global matching along rows and columns."""
     lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): one slice per step along the row
     total = path_costs(lines, STEP_PENALTY, JUMP_PENALTY).transpose(0, 1)
     total = total + path_costs(lines.transpose(0, 1).contiguous(), STEP_PENALTY, JUMP_PENALTY)
@@ -252,10 +252,10 @@ def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
 
 
 def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
-    """Inverse depth moved by up to two steps to the best match.
+    """Refine inverse depth by moving it up to two steps to the best match.
 
     Every pixel is warped with its own depth, so windows follow slanted surfaces. Costs are averaged over a window and
-    grow with the move, so areas without texture do not change.
+    grow with the distance of the move, so areas without texture do not change.
     """
     moves = torch.arange(-2, 3, device=inverse.device, dtype=inverse.dtype)
     hypotheses = (inverse + moves[:, None, None] * step).clamp_min(1e-6)
@@ -269,7 +269,7 @@ def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Flo
 
 
 def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
-    """Depth of view i averaged with that of the consistent views, and their number.
+    """Average the depth of view i with that of the consistent views, and count these.
 
     A view is consistent if its depth at the point agrees within DEPTH_TOLERANCE and its point projects back to
     within PIXEL_TOLERANCE of the pixel (Galliani et al. 2015, "Massively parallel multiview stereopsis", sec. 4).
@@ -294,7 +294,7 @@ def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int
 def unproject(
     depth: Float[Tensor, "h w"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w 3"]]:
-    """Pixel centres [px] and the world points at their depth."""
+    """Pixel centres [px] and their world points at the given depth."""
     y, x = torch.meshgrid(*(torch.arange(s, device=depth.device) + 0.5 for s in depth.shape), indexing="ij")
     pixels = torch.stack([x, y], -1)
     camera = torch.cat([(pixels - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(x)[..., None]], -1) * depth[..., None]
@@ -304,9 +304,9 @@ def unproject(
 def look_up_points(
     depth: Float[Tensor, "h w"], points: Float[Tensor, "*b 3"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "*b 3"], Bool[Tensor, "*b"]]:
-    """The surface points that a view has at the projections of `points`, and whether these are inside the image.
+    """Surface points that a view sees at the projections of `points`, and a mask of projections inside the image.
 
-    Each is on the exact ray, at the depth of the pixel.
+    A surface point is on the exact ray of the projection, at the depth of the pixel that contains it.
     """
     camera = points @ viewmat[:3, :3].mT + viewmat[:3, 3]
     z = camera[..., 2]

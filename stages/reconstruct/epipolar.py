@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 class EpipolarLines:
-    """Epipolar geometry of n pixels of one camera and m pixels of another.
+    """Epipolar geometry of n pixels `a` of one camera and m pixels `b` of another.
 
-    Cameras are those of pycolmap, poses world-to-camera. Distances [px] are to first order: Sampson 1982,
-    "Fitting conic sections to very scattered data".
+    Cameras are pycolmap cameras, poses are world-to-camera. Distances [px] are first-order: Sampson 1982, "Fitting
+    conic sections to very scattered data".
     """
 
     def __init__(self, camera_a, camera_b, viewmats: Float[Tensor, "2 4 4"], a: np.ndarray, b: np.ndarray):
@@ -23,12 +23,12 @@ class EpipolarLines:
         self.focal = camera_a.mean_focal_length()
 
     def distances(self) -> Float[Tensor, "n m"]:
-        """Of each pixel of the second camera from the line of each pixel of the first."""
+        """Distance of each pixel of the second camera from the epipolar line of each pixel of the first."""
         slopes = self.in_b[:, :2].square().sum(1)[:, None] + self.in_a[:, :2].square().sum(1)
         return (self.in_b.float() @ self.rays_b.float().mT).abs() / slopes.sqrt().clamp_min(1e-12).float() * self.focal
 
     def of_matches(self) -> Float[Tensor, "n"]:
-        """Of the pixels that match each other, in the same order in both cameras."""
+        """Distance of each pair of matching pixels, which are in the same order in both cameras (n = m)."""
         slopes = self.in_b[:, :2].square().sum(1) + self.in_a[:, :2].square().sum(1)
         return (self.in_b * self.rays_b).sum(1).abs() / slopes.sqrt().clamp_min(1e-12) * self.focal
 

@@ -22,14 +22,14 @@ from stages.core.scene.schema import reason
 from stages.reconstruct.colmap import colmap_process, import_pycolmap, run_colmap
 from stages.reconstruct.photos import Photos
 
-MAX_SIDE = 1024  # longest side for feature extraction [px]
-# Features kept per photo, the largest first; matching time grows with the square.
+MAX_SIDE = 1024  # longest side of the images in which features are found [px]
+# Most features per photo, largest first; matching time grows with the square.
 MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
-MAX_FOLDER_PATH = 440  # of a COLMAP database, whose own path SQLite limits to 512 bytes
-DATABASE_BYTES = 1_500_000  # of the features of a photo in a COLMAP database
-MAX_EXHAUSTIVE = 60  # up to this many photos all pairs are matched
-MAX_RATIO = 0.8  # of the distances of best and second best match (Lowe 2004)
-MAX_DESCRIPTOR_DISTANCE = 0.7  # of matching descriptors of unit length
+MAX_FOLDER_PATH = 440  # longest folder path of a COLMAP database [bytes]; SQLite limits the whole path to 512 bytes
+DATABASE_BYTES = 1_500_000  # size of the features of a photo in a COLMAP database
+MAX_EXHAUSTIVE = 60  # number of photos up to which all pairs are matched
+MAX_RATIO = 0.8  # largest ratio of the distances of best and second best match (Lowe 2004)
+MAX_DESCRIPTOR_DISTANCE = 0.7  # largest distance of matching descriptors of unit length
 
 # Keypoints (k, 4): x, y [px of the photo, centres at +0.5], scale, orientation; descriptors (k, 128), bytes.
 Feature = tuple[Tensor, Tensor]
@@ -37,7 +37,7 @@ Feature = tuple[Tensor, Tensor]
 
 @colmap_process()
 def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
-    """SIFT keypoints and root-SIFT descriptors of every photo, the largest first; always on the CPU."""
+    """SIFT keypoints and root-SIFT descriptors of every photo, largest first; always computed on the CPU."""
     limit = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
     at_once = 4 * torch.get_num_threads()
     out = []
@@ -55,7 +55,7 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
 
 
 def _grey(image: UInt8[Tensor, "h w 3"]) -> tuple[float, np.ndarray]:
-    """The size relative to the photo and the grey image, at most MAX_SIDE wide or high."""
+    """The scale factor and the grey image, which is at most MAX_SIDE wide or high."""
     grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
     shrink = min(1.0, MAX_SIDE / max(grey.shape))
     if shrink < 1:
@@ -65,7 +65,10 @@ def _grey(image: UInt8[Tensor, "h w 3"]) -> tuple[float, np.ndarray]:
 
 @contextmanager
 def writing_database(folder: Path) -> Iterator[None]:
-    """COLMAP's errors in writing its database, such as those of a full disk, as an InputError that names the folder."""
+    """Context manager that converts COLMAP's errors in writing a database, for example on a full disk, to InputError.
+
+    Also raises InputError for a folder whose path is too long.
+    """
     length = len(os.fsencode(folder.absolute()))
     if length > MAX_FOLDER_PATH:
         raise InputError(
@@ -79,7 +82,7 @@ def writing_database(folder: Path) -> Iterator[None]:
 
 
 def _check_space(folder: Path, needed: int) -> None:
-    """Raise InputError unless a folder has this many bytes free: COLMAP aborts the process on a full disk."""
+    """Raise InputError unless the folder has this many bytes free, since COLMAP aborts the process on a full disk."""
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise InputError(f"{folder}: has {free / 1e6:.0f} MB free, and these features need {needed / 1e6:.0f} "
@@ -89,7 +92,7 @@ def _check_space(folder: Path, needed: int) -> None:
 def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Keypoints (k, 6: x, y and a 2 x 2 matrix) and descriptors (k, 128) of each image.
 
-    Through files, since only COLMAP's own loop over files uses several threads.
+    Images are passed as files, since only COLMAP's own loop over files uses several threads.
     """
     pycolmap = import_pycolmap()
     with tempfile.TemporaryDirectory() as temporary:
@@ -111,7 +114,7 @@ def normalise(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:
 
 
 def select_pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
-    """Pairs of photos to match: all of up to MAX_EXHAUSTIVE, otherwise neighbours in order and similar photos.
+    """Select pairs of photos to match: all pairs of up to MAX_EXHAUSTIVE photos, else neighbours and similar photos.
 
     Similarity is the number of matches among the 200 largest features of each photo (preemptive matching).
     Source: Wu 2013, "Towards linear-time incremental structure from motion".
@@ -142,16 +145,16 @@ def match_descriptors(
         return torch.zeros(0, 2, dtype=torch.int64)
     similarity = a @ b.mT
     if allowed is not None:
-        similarity.masked_fill_(~allowed.to(similarity.device), -1.0)  # as far apart as descriptors can be
+        similarity.masked_fill_(~allowed.to(similarity.device), -1.0)  # the smallest possible similarity
     best, to_b = similarity.topk(2, dim=1)
     distance = (2 - 2 * best).clamp_min(0).sqrt()
     keep = ((distance[:, 0] < MAX_DESCRIPTOR_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])).nonzero()[:, 0]
     to_b = to_b[keep, 0]
-    mutual = similarity[:, to_b].argmax(0) == keep  # the best rows of these columns only: down columns is slow
+    mutual = similarity[:, to_b].argmax(0) == keep  # only in these columns, as a search along columns is slow
     return torch.stack([keep[mutual], to_b[mutual]], 1).cpu()
 
 
 def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[..., Tensor]:
-    """A function (i, j, allowed) -> matches of photos i and j by `match_descriptors`; `sizes` are not used."""
+    """Make a function (i, j, allowed) -> matches of photos i and j by `match_descriptors`; `sizes` is not used."""
     vectors = [normalise(descriptors).to(device) for _, descriptors in found]
     return lambda i, j, allowed=None: match_descriptors(vectors[i], vectors[j], allowed)

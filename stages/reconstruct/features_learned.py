@@ -1,7 +1,7 @@
 """SIFT features, plus ALIKED features matched by LightGlue for pairs with few SIFT matches.
 
-SIFT is fast and accurate enough to estimate the focal length from a short camera path; learned features also match
-under large viewpoint changes. A pair of photos with ENOUGH_SIFT_MATCHES keeps those, other pairs have both kinds.
+SIFT is fast, and accurate enough to estimate the focal length from a short camera path; learned features also match
+under large changes of viewpoint. A pair of photos with ENOUGH_SIFT_MATCHES uses only these, other pairs use both kinds.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from stages.core.models.matching.weights import load_network
 from stages.reconstruct import features
 from stages.reconstruct.photos import Photos
 
-MAX_FEATURES = 1024  # learned features per photo, highest scores first; matching time grows with the square
-MIN_SCORE = 0.02  # of a feature; LightGlue rejects unreliable ones
-ENOUGH_SIFT_MATCHES = 100  # photos without common content have up to 50
+MAX_FEATURES = 1024  # most learned features per photo, by score; matching time grows with the square
+MIN_SCORE = 0.02  # smallest score of a feature; LightGlue rejects unreliable ones
+ENOUGH_SIFT_MATCHES = 100  # SIFT matches from which a pair needs no others; photos without common content have up to 50
 
 # Keypoints (s + a, 4), SIFT before ALIKED; SIFT descriptors (s, 128); ALIKED descriptors (a, 128).
 HybridFeatures = tuple[Tensor, Tensor, Tensor]
@@ -54,9 +54,9 @@ def _learned(network: ALIKED, pixels: np.ndarray, device: str) -> tuple[Float[Te
 def make_matcher(
     found: list[HybridFeatures], sizes: list[tuple[int, int]], device: str
 ) -> Callable[..., Int[Tensor, "k 2"]]:
-    """A function (i, j, allowed) -> matches of photos i and j as rows (index in i, index in j); `sizes` in pixels.
+    """Make a function (i, j, allowed) -> matches of photos i and j as rows (index in i, index in j).
 
-    `allowed` (n, m) restricts those by SIFT.
+    `sizes` of the photos in pixels. The mask `allowed` (n, m), if given, restricts matches of SIFT features.
     """
     network = load_network("lightglue").to(device)
     sift = features.make_matcher([(table, descriptors) for table, descriptors, _ in found], sizes, device)

@@ -1,4 +1,4 @@
-"""Films of several fixed cameras -> the first frame of each as photos, and when it was taken."""
+"""Input from films of several fixed cameras: the frame of each film at the release, as photos, and its time."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from stages.reconstruct.synchronise import MotionSignal, find_motion, find_offse
 
 log = logging.getLogger(__name__)
 MOTION_SIDE = 64  # longest side of the frames in which motion is measured [px]
-SOUND_RATE = 48_000  # samples a second
-LOUDNESS_RATE = 10  # values of the loudness in a frame
-MAX_LATE = 600  # of the sound, after or before the pictures [s]
+SOUND_RATE = 48_000  # sampling rate to which sound is converted [Hz]
+LOUDNESS_RATE = 10  # loudness values per frame
+MAX_LATE = 600  # largest delay between sound and pictures, in either direction [s]
 
 
 def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, FilmedSequence]:
-    """The frame of each film at the release, and the times of the films.
+    """Read the frame of each film at the release, and synchronise the films.
 
     Raises InputError for a folder without films, films that cannot be synchronised, and films without motion.
     """
@@ -47,7 +47,7 @@ def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, Fi
         starts = {name: start for name, start in starts.items() if name not in missed}
     if len(starts) < 2:
         raise InputError(f"{folder}: fewer than two films show the release; they must begin before it")
-    # the second longest film after the release: a track needs two
+    # a track needs two films, so the sequence ends with the second longest film after the release
     shown = sorted(lengths[name] - start for name, start in starts.items())[-2]
     sequence = FilmedSequence(fps, max(1, math.ceil(min(rest - release + 1, shown))), starts)
     for name, start in starts.items():
@@ -78,9 +78,9 @@ def _first_frames(
 
 
 def loudness(path: Path, fps: float) -> np.ndarray:
-    """Logarithm of the loudness of a video's sound, LOUDNESS_RATE values in each frame from the first frame on.
+    """Logarithm of the loudness of a video's sound: LOUDNESS_RATE values per frame, from the first frame on.
 
-    Raises InputError for a recording without sound, and for one whose sound is damaged.
+    Raises InputError for a recording without sound or with damaged sound.
     """
     if not path.is_file():
         raise InputError(f"{path}: frames have no sound; use --sync motion")

@@ -1,4 +1,4 @@
-"""Depth maps -> the initial Gaussians of the photometric fit."""
+"""Initial Gaussians of the photometric fit, from depth maps."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.depth import DepthMap, look_up_points, unproject
 from stages.reconstruct.photos import Views
 
-MAX_INITIAL_POINTS = 6_000_000  # before downsampling; bounds memory at about 1 GB
-FREE_SPACE_MARGIN = 1.04  # a surface farther than this times the depth of a point proves free space at the point
-FOCUS_DETAIL = 3.0  # cells in focus are up to this much finer than the rest
+MAX_INITIAL_POINTS = 6_000_000  # most points before downsampling, which bounds memory to about 1 GB
+FREE_SPACE_MARGIN = 1.04  # a surface farther than this times the depth of a point proves that the point is free space
+FOCUS_DETAIL = 3.0  # largest ratio between the voxel sizes outside and in the focus
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class DepthViews:
         return self.maps[i].support >= self.min_support
 
     def to(self, device: str) -> DepthViews:
-        """With the depth maps on a device; the photos and cameras stay."""
+        """Move the depth maps to a device; photos and cameras stay where they are."""
         maps = [DepthMap(m.depth.to(device), m.support.to(device)) for m in self.maps]
         return DepthViews(self.views, maps, self.min_support)
 
@@ -57,17 +57,17 @@ class OrientedPoints:
         return OrientedPoints(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def to(self, device: torch.device | str) -> OrientedPoints:
-        """The points on a device."""
+        """Move the points to a device."""
         return OrientedPoints(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 def concatenate_points(clouds: list[OrientedPoints]) -> OrientedPoints:
-    """All points in order."""
+    """Concatenate clouds in order."""
     return OrientedPoints(*(torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(OrientedPoints)))
 
 
 def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tensor, "h w"]) -> OrientedPoints:
-    """Every pixel of view i as an oriented point (h * w in row order); normals from central differences over 4 px."""
+    """Every pixel of view i as an oriented point, h * w in row order; normals are central differences over 4 px."""
     K, viewmat = views.cameras.Ks[i].to(depth), views.cameras.viewmats[i].to(depth)
     _, points = unproject(depth, K, viewmat)
     padded = F.pad(points.permute(2, 0, 1)[None], (2, 2, 2, 2), mode="replicate")[0].permute(1, 2, 0)
@@ -80,7 +80,7 @@ def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: F
 
 
 def fuse(observed: DepthViews) -> OrientedPoints:
-    """The consistent depth of all views as points, without points in the free space before a consistent surface.
+    """Fuse the consistent depth of all views to points, without points in the free space in front of a surface.
 
     A point is dropped if more than half as many views contradict it as support it.
     """
@@ -98,7 +98,7 @@ def fuse(observed: DepthViews) -> OrientedPoints:
 
 
 def free_space_violations(points: Float[Tensor, "n 3"], observed: DepthViews, min_support: int) -> Float[Tensor, "n"]:
-    """Number of views that have a surface with `min_support` behind each point, so that the point is in free space."""
+    """Number of views in which each point is in free space: in front of a surface with at least `min_support`."""
     count, cameras = torch.zeros_like(points[:, 0]), observed.views.cameras
     for K, viewmat, m in zip(cameras.Ks.to(points), cameras.viewmats.to(points), observed.maps, strict=True):
         known = torch.where(m.support >= min_support, m.depth, torch.zeros_like(m.depth))
@@ -109,11 +109,11 @@ def free_space_violations(points: Float[Tensor, "n 3"], observed: DepthViews, mi
 
 
 def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], radius: float) -> OrientedPoints:
-    """About `target` points: the weighted mean of the points in each voxel.
+    """Reduce a cloud to about `target` points: the weighted mean of the points in each voxel.
 
-    The voxel size is proportional to the pixel size at the point, rounded to a power of two, so detail near the cameras
-    is kept; within a third of the cameras' distance `radius` from `focus` voxels are up to 3 times finer. The factor is
-    found by bisection.
+    The voxel size is proportional to the pixel size at the point, rounded to a power of two, so that detail near the
+    cameras is kept; within a third of the cameras' distance `radius` from `focus` voxels are up to 3 times finer. The
+    factor of proportionality is found by bisection.
     """
     if len(cloud) <= target:
         return cloud
@@ -140,7 +140,7 @@ def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], ra
 
 
 def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """A hash of the voxel of each point, whose side is the power of two nearest to `size`."""
+    """Hash of the voxel of each point; its side is the power of two nearest to `size`."""
     level = size.log2().round()
     index = (points / 2.0 ** level[:, None]).floor().long()
     hashed = index[:, 0] * 73856093 ^ index[:, 1] * 19349663 ^ index[:, 2] * 83492791  # Teschner et al. 2003
@@ -152,10 +152,10 @@ def fill_unmatched(
 ) -> OrientedPoints:
     """Points for pixels without consistent depth: every `stride`-th pixel that `cloud` does not cover.
 
-    Their depth is, in this order: that of the supporting plane, where its points are near or the matched depth is close
-    to it; the matched depth, if at least one view agrees; the depth interpolated from consistent pixels, where these
-    surround the pixel; otherwise `far`, where a wrong point occludes nothing. Points in the free space before a surface
-    that a view confirms are moved to `far` too. The points are on the device of the depth maps.
+    Their depth is the first of these: that of the supporting plane, if points on the plane are near or the matched
+    depth is close to it; the matched depth, if at least one view agrees; the depth interpolated from consistent pixels,
+    if these surround the pixel; and `far`, where a wrong point occludes nothing. Points in the free space in front of a
+    surface that a view confirms are moved to `far` too. The points are on the device of the depth maps.
     """
     views, clouds, device = observed.views, [], observed.maps[0].depth.device
     opaque = to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
@@ -179,7 +179,7 @@ def fill_unmatched(
 
 
 def surrounded_pixels(known: Bool[Tensor, "h w"], radius: int = 16) -> Bool[Tensor, "h w"]:
-    """Pixels with more than 30 % known pixels within `radius`: holes in a surface rather than its open boundary."""
+    """Mask of pixels with more than 30 % known pixels within `radius`: holes in a surface, not its open boundary."""
     fraction, side = known[None, None].float(), 2 * radius + 1
     for window, border in (((side, 1), (radius, 0)), ((1, side), (0, radius))):
         fraction = F.avg_pool2d(fraction, window, 1, border, count_include_pad=True)
@@ -210,15 +210,15 @@ def interpolate_depth(depth: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -
 
 @dataclass(frozen=True)
 class _PlanePoints:
-    """The supporting plane, and the cells of the points that lie on it."""
+    """The supporting plane, and the cells that contain points on it."""
 
     plane: Plane
-    side: float  # of a cell [scene units]
-    cells: Int[Tensor, "c"]
+    side: float  # side of a cell [scene units]
+    cells: Int[Tensor, "c"]  # hashes of the cells
 
     @classmethod
     def of(cls, cloud: OrientedPoints, plane: Plane, device: torch.device) -> _PlanePoints | None:
-        """None where no point lies on the plane."""
+        """Find the points of `cloud` on the plane; None if there are none."""
         size = float((cloud.points - cloud.points.median(0).values).norm(dim=1).median())
         known = cloud.points[plane.heights(cloud.points).abs() < 0.02 * size]
         cells = _cells(known, torch.full((1,), 0.1 * size)).unique().to(device)
@@ -228,8 +228,10 @@ class _PlanePoints:
 def _depth_on_plane(
     views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], on: _PlanePoints
 ) -> Float[Tensor, "h w"]:
-    """`depth`, replaced by that of the supporting plane where points on the plane are near, or where the depth
-    `matched` is within 3 % of it."""
+    """Replace `depth` by that of the supporting plane near points on the plane, or where `matched` agrees with it.
+
+    Depths agree if they differ by less than 3 %.
+    """
     K, viewmat = views.cameras.Ks[i].to(depth), views.cameras.viewmats[i].to(depth)
     _, ones = unproject(torch.ones_like(depth), K, viewmat)
     eye = -viewmat[:3, :3].mT @ viewmat[:3, 3]
@@ -243,14 +245,14 @@ def _depth_on_plane(
 
 @torch.no_grad()
 def covered_pixels(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "h w"]:
-    """Pixels of view i where the Gaussians have an alpha above 0.5."""
+    """Mask of the pixels of view i where the Gaussians have an alpha above 0.5."""
     height, width = views.images[i].shape[:2]
     viewmats, Ks = (x[[i]].to(gaussians.means) for x in (views.cameras.viewmats, views.cameras.Ks))
     return rasterise(gaussians, viewmats, Ks, width, height).alpha[0] > 0.5
 
 
 def to_gaussians(cloud: OrientedPoints, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:
-    """Flat Gaussians on the points: standard deviations 0.6 times the neighbour distance, a fifth along the normal."""
+    """Flat Gaussians at the points, with standard deviations of 0.6 neighbour distances; a fifth along the normal."""
     width = (0.6 * spacing(cloud.points)).clamp(min=0.3 * cloud.footprint, max=8 * cloud.footprint)
     quats = quats_from_normals(cloud.normals)
     sh = torch.zeros(len(cloud), (degree + 1) ** 2, 3)

@@ -1,4 +1,4 @@
-"""The learned backends: π³, whose point maps become Gaussians, and Pi3-splat, which predicts Gaussians.
+"""The learned backends: π³, whose point maps are converted to Gaussians, and Pi3-splat, which predicts Gaussians.
 
 Source of π³: Wang et al. 2025, arXiv:2507.13347.
 """
@@ -43,12 +43,12 @@ class NetworkOutput(NamedTuple):
 
 
 def pi3(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
-    """Backend `pi3`: cameras and point maps of 1 to 100 photos by π³; the Gaussians start on the points."""
+    """Backend `pi3`: cameras and point maps of 1 to 100 photos by π³; Gaussians are initialised at the points."""
     return _reconstruct("pi3", photos, options, steps)
 
 
 def pi3_splat(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
-    """Backend `pi3-splat`: the same, with the Gaussians predicted by the splat head."""
+    """Backend `pi3-splat`: as `pi3`, but the splat head predicts the Gaussians."""
     return _reconstruct("pi3-splat", photos, options, steps)
 
 
@@ -65,7 +65,7 @@ def _reconstruct(name: str, photos: Photos, options: ReconstructOptions, steps: 
 def _predict_geometry(
     name: str, images: Float[Tensor, "v 3 h w"], options: ReconstructOptions, device: str
 ) -> tuple[Geometry, Tensor | None]:
-    """Output of the network; the raw Gaussian parameters are None for π³."""
+    """Load the network and run it; the raw Gaussian parameters are None for π³."""
     weights = find_or_download(partial(find, name), partial(download, name), options.weights, options.download)
     model = load(weights, name)
     return predict(model, images, device)
@@ -73,9 +73,9 @@ def _predict_geometry(
 
 @torch.no_grad()
 def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> tuple[Geometry, Tensor | None]:
-    """Run the network, in bf16 on a GPU, in chunks of as many views as fit in memory; results on the CPU.
+    """Run the network, in bf16 on a GPU, in chunks of as many views as fit in memory; results are on the CPU.
 
-    Raises InputError where the weights do not fit.
+    Raises InputError if the weights do not fit.
     """
     half, splats = device != "cpu", isinstance(model, Pi3Splat)
     config = model.encoder.config if splats else model.config
@@ -94,7 +94,7 @@ def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> 
         output = model(images.to(device), at_once)
     geometry, raw = output if splats else (output, None)
     on_cpu = (x.cpu() for x in (geometry.points, geometry.confidence, geometry.poses))
-    return Geometry(*on_cpu), None if raw is None else raw.half().cpu()  # 70 bytes a pixel
+    return Geometry(*on_cpu), None if raw is None else raw.half().cpu()  # 70 bytes per pixel
 
 
 def assemble(
@@ -105,7 +105,7 @@ def assemble(
     steps: StepCache,
     device: str,
 ) -> Reconstruction:
-    """A scene from the output of the network for the cropped photos."""
+    """Build the scene from the network's output for the cropped photos."""
     geometry = network.geometry
     confident = pointmaps.confident_pixels(geometry)
     log.info("the network is confident in %.0f %% of the pixels", 100 * float(confident.float().mean()))

@@ -1,4 +1,4 @@
-"""Features, matches and verified two-view geometry of all photos, in a COLMAP database."""
+"""Matching of photos: a COLMAP database with features, matches and verified two-view geometry."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
-FOCAL_STARTS = 1.2, 0.8  # of photos without EXIF [longer sides]: COLMAP's, and the main cameras of phones
-MAX_EPIPOLAR_ERROR = 0.006  # for given cameras [photo sizes]: 4 px of 640
+FOCAL_STARTS = 1.2, 0.8  # initial focal lengths without EXIF [longer side]: COLMAP's, and of the main cameras of phones
+MAX_EPIPOLAR_ERROR = 0.006  # largest epipolar error of a match for given cameras [photo size]: 4 px of 640
 MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # indices of two photos, and matching pixels (k, 2) in each
 
 
 class MatchingOptions(NamedTuple):
-    """How photos are matched."""
+    """Options of matching."""
 
-    matcher: str = "sift"  # of FEATURE_MATCHERS
+    matcher: str = "sift"  # key of FEATURE_MATCHERS
     seed: int = 0
     device: str = "cpu"
 
@@ -37,10 +37,11 @@ def build_database(
     photos: Photos, cameras: list, steps: StepCache, matching: MatchingOptions,
     viewmats: Float[Tensor, "c 4 4"] | None = None,
 ) -> Path:  # fmt: skip
-    """Path of a COLMAP database with verified matches of the photos; `cameras` are pycolmap cameras, one per photo.
+    """Match the photos; returns the path of a COLMAP database with verified matches.
 
-    Where the poses `viewmats` are known, verified matches are those along their epipolar lines; else a geometry is
-    fitted to the matches, which a pattern that repeats may mislead.
+    `cameras` are pycolmap cameras, one per photo. If the poses `viewmats` are known, matches are verified by their
+    distance from epipolar lines. Otherwise a two-view geometry is fitted to the matches, which repeated patterns may
+    mislead.
     """
     extract = load(FEATURE_EXTRACTORS[matching.matcher])
 
@@ -55,8 +56,8 @@ def build_database(
 def initial_cameras(photos: Photos) -> list:
     """Initial pycolmap camera of each photo, shared by photos of the same size and EXIF focal length.
 
-    Without EXIF the focal length is FOCAL_STARTS[0] times the longer side. The model is SIMPLE_RADIAL, which is enough
-    for phones and most lenses; sharing stabilises weak geometry.
+    Without EXIF the focal length is FOCAL_STARTS[0] times the longer side. The camera model is SIMPLE_RADIAL, which is
+    sufficient for phones and most lenses; sharing it stabilises weak geometry.
     """
     import pycolmap
 
@@ -73,7 +74,7 @@ def initial_cameras(photos: Photos) -> list:
 
 
 def set_unknown_focals(database: Path, factor: float) -> None:
-    """Set the focal lengths that no EXIF tells to `factor` times the longer side."""
+    """Set the focal lengths that are unknown from EXIF to `factor` times the longer side."""
     import pycolmap
 
     file = pycolmap.Database.open(database)
@@ -93,7 +94,7 @@ def verified_pairs(database: Path) -> list[MatchedPair]:
 
 
 def all_pairs(database: Path) -> list[MatchedPair]:
-    """The pairs of photos with matches, verified or not, as `verified_pairs`."""
+    """The pairs of photos with matches, verified or not; numbered as by `verified_pairs`."""
     return _pairs(database, lambda file: zip(*file.read_all_matches(), strict=True))
 
 
@@ -141,7 +142,7 @@ def _write_database(
 def _match_and_verify(
     found: list[features.Feature], cameras: list, matching: MatchingOptions, viewmats: Float[Tensor, "c 4 4"] | None
 ) -> list[tuple]:
-    """Matches and two-view geometry of the selected pairs; other threads verify while the next pairs are matched."""
+    """Matches and two-view geometry of the selected pairs, verified in other threads while more pairs are matched."""
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
@@ -152,7 +153,7 @@ def _match_and_verify(
     match = load(FEATURE_MATCHERS[matching.matcher])(found, [(c.width, c.height) for c in cameras], matching.device)
 
     def guided(i: int, j: int, matches: np.ndarray) -> tuple:
-        """The same with matches along epipolar lines: other tiles of a pattern are mostly not on them."""
+        """Match again along epipolar lines, which excludes most other repetitions of a pattern."""
         lines = EpipolarLines(cameras[i], cameras[j], viewmats[[i, j]], pixels[i], pixels[j])
         near = lines.distances() < MAX_EPIPOLAR_ERROR * max(cameras[i].width, cameras[i].height)
         rows = match(i, j, near)

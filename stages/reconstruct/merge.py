@@ -1,4 +1,4 @@
-"""Reduction of Gaussians: those in a voxel are merged into one with the same moments."""
+"""Reduction of Gaussians: all Gaussians in a voxel are merged into one with the same moments."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ PRIMES = (73_856_093, 19_349_663, 83_492_791)  # Teschner et al. 2003, "Optimize
 
 
 def merge_gaussians(gaussians: Gaussians, footprint: Float[Tensor, "n"], target: int) -> Gaussians:
-    """About `target` Gaussians or fewer.
+    """Reduce Gaussians to about `target` or fewer.
 
-    The voxel size is proportional to the width of a pixel at the Gaussian, `footprint` [scene units], in powers of two,
-    so detail near the cameras is kept; the factor is found by bisection. A merged Gaussian has the mean and covariance
-    of the mixture, weighted by opacity and area, and the weighted means of opacity and harmonics.
+    The voxel size is proportional to the width of a pixel at the Gaussian, `footprint` [scene units], rounded to a
+    power of two, so that detail near the cameras is kept; the factor of proportionality is found by bisection. A merged
+    Gaussian has the mean and covariance of the mixture, weighted by opacity and area, and the weighted means of opacity
+    and harmonics.
     Source: Kerbl et al. 2024, "A hierarchical 3D Gaussian representation", sec. 4.1.
     """
     if len(gaussians) <= target:
@@ -34,7 +35,7 @@ def merge_gaussians(gaussians: Gaussians, footprint: Float[Tensor, "n"], target:
 
 
 def _joined(g: Gaussians, cell: Int[Tensor, "n"], weight: Float[Tensor, "n"]) -> Gaussians:
-    """One Gaussian for each cell number 0, 1, ..."""
+    """Merge the Gaussians of each cell 0, 1, ... into one."""
     count = int(cell.max()) + 1
     fraction = weight / weight.new_zeros(count).index_add_(0, cell, weight)[cell]
 
@@ -49,7 +50,7 @@ def _joined(g: Gaussians, cell: Int[Tensor, "n"], weight: Float[Tensor, "n"]) ->
 
 
 def _cells(points: Float[Tensor, "n 3"], footprint: Float[Tensor, "n"], pixels: float) -> Int[Tensor, "n"]:
-    """A hash of the voxel of each point; voxels span `pixels` to 2 `pixels` footprints."""
+    """Hash of the voxel of each point; the side of a voxel is `pixels` footprints, rounded down by up to half."""
     smallest = footprint.min().clamp_min(1e-12)
     level = (footprint / smallest).log2().floor()
     index = (points / (pixels * smallest * 2**level)[:, None]).floor().long()

@@ -1,4 +1,4 @@
-"""Photos cropped and resized for a vision transformer: one size, sides multiples of the patch size."""
+"""Input of a vision transformer: photos cropped and resized to one size, with sides that are multiples of its patch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from stages.core.scene.cameras import Cameras, PhotoIntrinsics
 from stages.core.scene.images import resize
 from stages.reconstruct.photos import Photos
 
-MAX_PIXELS = 201_000  # per photo, as published (448 x 448 for a square one)
+MAX_PIXELS = 201_000  # most pixels per photo, as published (448 x 448 for a square photo)
 
 
 def network_size(width: int, height: int, longest: int | None = None) -> tuple[int, int]:
-    """Width and height, multiples of 14: as large as the photo, MAX_PIXELS and the longest side `longest` allow.
+    """Largest width and height, in multiples of 14, within the photo, MAX_PIXELS and the longest side `longest`.
 
-    Of the multiples next to the exact size those with most pixels are taken.
+    Among the multiples next to the exact size, those with most pixels are chosen.
     """
     shrink = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5, (longest or width + height) / max(width, height))
     choices = []
@@ -32,7 +32,7 @@ def network_size(width: int, height: int, longest: int | None = None) -> tuple[i
 
 
 def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
-    """The centre of every photo, cropped to the aspect ratio of `common_size`.
+    """Crop every photo at its centre to the aspect ratio of `common_size`.
 
     The optical axis remains in the centre and pixels remain square.
     """
@@ -44,7 +44,7 @@ def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor
 
 
 def photo_intrinsics(photos: Photos, cameras: Cameras) -> PhotoIntrinsics:
-    """Intrinsics of the whole photos, in pixels of their files, for cameras of their cropped centres; no distortion.
+    """Intrinsics of the whole photos, in pixels of their files, from the cameras of their crops; without distortion.
 
     `cameras` have the size `common_size`.
     """
@@ -73,7 +73,7 @@ def common_size(photos: Photos, longest: int | None = None) -> tuple[int, int]:
 
 
 def resize_bytes(image: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "h2 w2 3"]:
-    """An 8-bit image resized."""
+    """Resize an 8-bit image."""
     return (resize(image.float() / 255, width, height) * 255).round().clamp(0, 255).to(torch.uint8)
 
 

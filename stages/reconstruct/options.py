@@ -22,7 +22,7 @@ FEATURE_MATCHERS = {
     "sift": "stages.reconstruct.features:make_matcher",
     "aliked-lightglue": "stages.reconstruct.features_learned:make_matcher",
 }
-UP_SIDES = ("top", "right", "bottom", "left")  # of photos, where up may be
+UP_SIDES = ("top", "right", "bottom", "left")  # sides of photos that may be up
 SYNCHRONISATIONS = ("motion", "audio")
 SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that accept a single photo
 MAX_ITERATIONS = 1_000_000  # other trainers take 7,000 to 30,000
@@ -33,9 +33,9 @@ class QualityPreset:
     """Sizes and counts of a quality level."""
 
     max_side: int  # longest side of the views [px]
-    gaussians: int  # at the start
+    gaussians: int  # initial number
     iterations: int  # of the photometric fit on a CPU, each on one photo; up to twice as many for many photos
-    iterations_cuda: int  # the same on a GPU
+    iterations_cuda: int  # of the photometric fit on a GPU
     degree: int  # of the spherical harmonics
 
 
@@ -124,7 +124,7 @@ class ReconstructOptions:
         return self.resolution or self.preset.max_side
 
     def iteration_count(self, photos: int, device: str) -> int:
-        """Iterations of the photometric fit, from quality, device and number of photos only, for reproducibility."""
+        """Iterations of the photometric fit; for reproducibility a function of quality, device and number of photos."""
         if self.iterations is not None:
             return self.iterations
         base = self.preset.iterations_cuda if device == "cuda" else self.preset.iterations

@@ -1,4 +1,4 @@
-"""A folder of photos or a video -> photos in memory, the sharpest ones where there are many."""
+"""Reading of a folder of photos or a video; if there are many photos or frames, the sharpest are selected."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.photos import Photos
 
 log = logging.getLogger(__name__)
-MAX_PHOTOS = 200  # used of a folder; bounds time and memory
-MANY_PHOTOS = 60  # above this number photos are kept at the smaller size
+MAX_PHOTOS = 200  # most photos used of a folder, to bound time and memory
+MANY_PHOTOS = 60  # number of photos above which they are kept at the smaller size
 MAX_SIDES = (1600, 1024)  # longest side of photos in memory [px], for few and for many photos
-VIDEO_FRAMES = (30, 60)  # minimum and maximum number taken from a video
-FRAMES_PER_SECOND = 1.5
-MAX_CANDIDATES = 12  # frames per span of a video whose sharpness is compared
+VIDEO_FRAMES = (30, 60)  # fewest and most frames selected from a video
+FRAMES_PER_SECOND = 1.5  # frames selected per second of a video, within VIDEO_FRAMES
+MAX_CANDIDATES = 12  # most frames per span of a video whose sharpness is compared
 PHONE_SUFFIXES = {".heic", ".heif", ".avif"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 
@@ -41,11 +41,11 @@ class LoadedImage(NamedTuple):
 
 
 def read_photos(path: Path, side: int = 0, min_count: int = 2) -> Photos:
-    """The photos of a folder, sorted by name, or the sharpest frames of a video.
+    """Read the photos of a folder, sorted by name, or the sharpest frames of a video.
 
     Photos larger than MAX_SIDES are reduced to it, or to `side` if that is larger. Of more than MAX_PHOTOS photos the
     sharpest of each span of neighbours is used; photos that cannot be read are left out with a warning. Raises
-    InputError where fewer than `min_count` remain, or for a path without photos.
+    InputError if fewer than `min_count` photos remain, or for a path without photos.
     """
     path = Path(path)
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
@@ -126,9 +126,10 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
 
 
 def _is_truncated(data: bytes) -> bool:
-    """Whether a JPEG has no end marker, the rest of which decoders fill with grey, or a PNG no last chunk.
+    """Whether a JPEG has no end marker (decoders fill the missing part with grey), or a PNG no last chunk.
 
-    The marker is searched for after the header segments, where thumbnails have one too; phones append videos after it.
+    The marker is searched for after the header segments, since thumbnails in them have one too, and not only at the
+    end, since phones append videos.
     """
     if data[:2] == b"\xff\xd8":
         at = 2
@@ -141,7 +142,7 @@ def _is_truncated(data: bytes) -> bool:
 def _exif_focal(file: Path) -> float:
     """Focal length in pixels of the stored photo from EXIF (and COLMAP's table of sensors), 0 where unknown.
 
-    It is also 0 without pycolmap: estimate_cameras, which needs it, reports that; networks do without.
+    It is also 0 if pycolmap is absent: `estimate_cameras`, which needs pycolmap, reports that; networks do not need it.
     """
     try:
         pycolmap = import_pycolmap()
@@ -155,7 +156,7 @@ def _exif_focal(file: Path) -> float:
 
 
 def _from_video(path: Path, side: int) -> list[LoadedImage]:
-    """The sharpest frame of each span of equal duration."""
+    """The sharpest frame of each span of a video; spans have equal duration."""
     with open_video(path) as file:
         times = sorted(float(p.pts * p.time_base) for p in file.demux(video=0) if p.pts is not None)
     length = times[-1] - times[0] if times else 0.0
@@ -168,7 +169,7 @@ def _from_video(path: Path, side: int) -> list[LoadedImage]:
 
 
 def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[tuple[int, LoadedImage]]:
-    """Up to about MAX_CANDIDATES rotated frames per span, each with its span; reading ends at damaged data."""
+    """Up to about MAX_CANDIDATES upright frames per span, each with its span; reading ends at damaged data."""
     seen: Counter[int] = Counter()
     interval = max(1, len(times) // max(1, spans * MAX_CANDIDATES))
     with open_video(path) as file:
@@ -198,6 +199,6 @@ def _sharpest(photos: Iterable[tuple[int, LoadedImage]], spans: int) -> list[Loa
 
 
 def sharpness(image: UInt8[Tensor, "h w 3"]) -> float:
-    """Variance of the Laplacian of the grey image, at most 512 px large."""
+    """Sharpness of an image: variance of the Laplacian of the grey image, reduced to at most 512 px."""
     grey = cv2.cvtColor(limit_size(image, 512).numpy(), cv2.COLOR_RGB2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())

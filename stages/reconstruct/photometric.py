@@ -1,11 +1,11 @@
-"""Photometric fit: Gaussians optimised by gradient descent through the rasteriser.
+"""Photometric fit: optimises Gaussians by gradient descent through the rasteriser.
 
 Loss and learning rates follow Kerbl et al. 2023, "3D Gaussian Splatting", sec. 5 and its code; the Gaussians start on
-matched surfaces, so a few hundred iterations are enough on a CPU. Sizes are regularised as in Kheradmand et al. 2024,
-"3D Gaussian Splatting as Markov Chain Monte Carlo", sec. 4, against overfitting few photos, and each step leaves out a
+matched surfaces, so a few hundred iterations are enough on a CPU. Against overfitting few photos, sizes are regularised
+as in Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", sec. 4, and each step leaves out a
 random part of the Gaussians (Park et al. 2025, "DropGaussian: Structural Regularization for Sparse-view Gaussian
-Splatting"). Opacities are not regularised: later stages segment and move the surfaces, which have to be opaque.
-The number of iterations is fixed beforehand and independent of time, so a seed gives the same scene again.
+Splatting"). Opacities are not regularised, since later stages segment and move the surfaces, which must be opaque.
+The number of iterations does not depend on elapsed time, so that results are reproducible for a seed.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.photos import Views
 
-SSIM_WEIGHT = 0.2  # of 1 - SSIM; L1 has the rest
+SSIM_WEIGHT = 0.2  # weight of 1 - SSIM in the loss; that of L1 is the rest
 LEARNING_RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
 MEANS_RATE = 2e-4  # learning rate of the means [camera distances]
-MEANS_DECAY = 0.01  # factor on this rate at the end of the exponential decay
-DEPTH_WEIGHT = 0.1  # of the error in inverse depth [1 / camera distance]
-MIN_DEPTH = 0.1  # rendered depth is clamped to this in the depth term [camera distances]
-SCALE_WEIGHT = 0.01  # of the mean scale [camera distances]
-DROPOUT = 0.1  # share of the Gaussians left out of a step at the end of a fit, linear in time from none
+MEANS_DECAY = 0.01  # factor on MEANS_RATE at the end of a fit; the decay is exponential
+DEPTH_WEIGHT = 0.1  # weight of the error of inverse depth [1 / camera distance] in the loss
+MIN_DEPTH = 0.1  # lower bound of rendered depth in the depth term [camera distances]
+SCALE_WEIGHT = 0.01  # weight of the mean scale [camera distances] in the loss
+DROPOUT = 0.1  # fraction of the Gaussians left out of the last step of a fit; it grows linearly from 0
 
 
 @dataclass(frozen=True)
 class DensityControl:
     """When Gaussians are split and pruned; compare the fields of gsplat's `DefaultStrategy`."""
 
-    min_iterations: int = 200  # no splitting in shorter fits
+    min_iterations: int = 200  # shorter fits do not split Gaussians
     split_times: tuple[float, ...] = (0.2, 0.4)  # fractions of the iterations after which Gaussians are split
-    split_fraction: float = 0.08  # of the Gaussians, each time
-    split_offset: float = 0.7  # of the two halves from the mean, in random samples of the Gaussian
-    split_log_scale: float = 0.47  # by which the log scales of the halves are reduced: 1.6 times smaller
+    split_fraction: float = 0.08  # fraction of the Gaussians that is split each time
+    split_offset: float = 0.7  # offset of the two halves from the mean, relative to a random sample of the Gaussian
+    split_log_scale: float = 0.47  # reduction of the log scales of the halves, which are thus 1.6 times smaller
     min_opacity: float = 0.02  # Gaussians of lower opacity are pruned
     min_lens_distance: float = 0.1  # Gaussians closer to a camera are pruned [camera distances]
-    max_scale: float = 0.1  # larger Gaussians are pruned [distances from the mean camera centre]
+    max_scale: float = 0.1  # larger Gaussians are pruned [distance from the mean camera centre]
 
 
 DENSITY = DensityControl()
@@ -63,9 +63,9 @@ DENSITY = DensityControl()
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Length and scale of a fit."""
+    """Options of a fit."""
 
-    iterations: int  # each on one photo
+    iterations: int  # number of steps, each on one photo
     camera_distance: float  # typical distance of the cameras from the objects [scene units]
     seed: int = 0
     device: str = "cpu"
@@ -77,15 +77,15 @@ class _Fit:
 
     values: dict[str, Tensor]
     moments: dict[str, Moments]
-    rates: dict[str, Float[Tensor, "1"]]  # learning rates, but for that of the means, which decays
-    steps: Float[Tensor, "1"]  # that were taken
+    rates: dict[str, Float[Tensor, "1"]]  # learning rates, except that of the means, which decays
+    steps: Float[Tensor, "1"]  # number of steps so far
     camera_distance: float  # [scene units]
-    gradients: Float[Tensor, "n"]  # sum of the norms of the means' gradients since the last split
-    lots: Float[Tensor, "n"]  # 0..1, random: a step leaves out an interval of them
+    gradients: Float[Tensor, "n"]  # sum of the norms of the gradients of the means since the last split
+    lots: Float[Tensor, "n"]  # random numbers in 0..1; a step leaves out the Gaussians in an interval of them
 
     @classmethod
     def start(cls, gaussians: Gaussians, views: int, camera_distance: float) -> _Fit:
-        """Parameters of these Gaussians, activations inverted, and zero log exposures."""
+        """Initial parameters: those of the Gaussians with inverted activations, and zero log exposures."""
         device = gaussians.means.device
         values = {
             "means": gaussians.means,
@@ -103,11 +103,11 @@ class _Fit:
         return cls(values, moments, rates, steps, camera_distance, gradients, _lots(len(gaussians), device))
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians with activations applied, differentiable; the projection normalises the quats."""
+        """The Gaussians with activations applied; differentiable. The projection normalises the quaternions."""
         v = self.values
         sh = torch.cat([v["base"], v["rest"]], 1) if "rest" in v else v["base"]
         ids = torch.zeros(len(sh), dtype=torch.int64, device=sh.device)
-        with small_operations():  # the last elements of each thread's part are rounded differently by these functions
+        with small_operations():  # exp and sigmoid round the last elements of each thread's part differently
             scales, opacities = v["scales"].exp(), v["opacities"].sigmoid()
         return Gaussians(v["means"], v["quats"], scales, opacities, sh, ids)
 
@@ -119,7 +119,7 @@ class _Fit:
             adam_step(value, grads[name], self.moments[name], rate, self.steps)
 
     def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"]) -> None:
-        """Keep (or repeat) these Gaussians with their Adam moments; moments at positions `fresh` are set to zero."""
+        """Keep (or repeat) these Gaussians with their Adam moments; moments at the new rows `fresh` are set to 0."""
         for name in self.values.keys() - {"gains"}:
             self.values[name] = self.values[name].detach()[index].clone().requires_grad_()
             old = self.moments[name]
@@ -135,24 +135,24 @@ def _lots(count: int, device: torch.device | str) -> Float[Tensor, "n"]:
 
 
 class _Draw(NamedTuple):
-    """What is random or scheduled in a step."""
+    """Random and scheduled parameters of a step."""
 
-    row: Int[Tensor, "1"]  # of the photo in its group
-    grey: Float[Tensor, "1"]  # of the background
+    row: Int[Tensor, "1"]  # row of the photo in its group
+    grey: Float[Tensor, "1"]  # grey level of the background, 0..1
     means_rate: Float[Tensor, "1"]  # learning rate of the means
-    dropout: Float[Tensor, "1"]  # share of the Gaussians that are left out
-    lot: Float[Tensor, "1"]  # 0..1: where their interval begins
+    dropout: Float[Tensor, "1"]  # fraction of the Gaussians that are left out
+    lot: Float[Tensor, "1"]  # 0..1, start of the interval of `lots` that is left out
 
 
 @dataclass(frozen=True)
 class _Targets:
     """Photos of one size with their cameras and target depths, on the device of the fit."""
 
-    rows: tuple[int, ...]  # views
+    rows: tuple[int, ...]  # indices of the views
     images: UInt8[Tensor, "c h w 3"]
-    cameras: Float[Tensor, "c 26"]  # as `pack_camera` packs them
+    cameras: Float[Tensor, "c 26"]  # packed by `pack_camera`
     exposures: Float[Tensor, "c v"]  # rows of `_exposure_projection`
-    inverse: Float[Tensor, "c h w"] | None  # inverse depth times the camera distance, inf where unknown
+    inverse: Float[Tensor, "c h w"] | None  # inverse depth times the camera distance; inf where unknown
 
     @property
     def size(self) -> tuple[int, int]:
@@ -161,7 +161,7 @@ class _Targets:
 
 
 def _targets(views: Views, depths: Sequence[Tensor], distance: float, device: str) -> list[_Targets]:
-    """The views by size."""
+    """Group the views by size."""
     projection = _exposure_projection(views.cameras)
     groups: dict[tuple[int, int], list[int]] = {}
     for row, image in enumerate(views.images):
@@ -180,10 +180,10 @@ def _targets(views: Views, depths: Sequence[Tensor], distance: float, device: st
 def fit_gaussians(
     gaussians: Gaussians, views: Views, options: FitOptions, depths: Sequence[Float[Tensor, "h w"]] = ()
 ) -> Gaussians:
-    """Gaussians optimised to render like the photos.
+    """Optimise Gaussians to render like the photos.
 
-    One photo per iteration, in random order without repeats. `depths` of the views, 0 where unknown, are a second
-    target. The background is a random grey in every iteration, so surfaces become opaque.
+    Each iteration uses one photo; photos come in random order without repetition. `depths` of the views, 0 where
+    unknown, are a second target. The background is a random grey in every iteration, so that surfaces become opaque.
     """
     steps, distance, device = options.iterations, options.camera_distance, options.device
     if not steps:
@@ -198,7 +198,7 @@ def fit_gaussians(
     order: list[int] = []
     first = 0
     with tqdm(total=steps, desc="fitting photos", unit="step", leave=False) as bar:
-        for last in [*splits, steps - 1]:  # the last steps of the parts between splits
+        for last in [*splits, steps - 1]:  # last step of each segment between splits
             schedule = []
             for step in range(first, last + 1):
                 order = order or torch.randperm(len(views), generator=generator).tolist()
@@ -214,10 +214,10 @@ def fit_gaussians(
 
 
 def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
-    """Projection that removes from one value per camera the part that is constant or linear in its pose.
+    """Projection matrix that removes from values per camera the part that is constant or linear in the camera's pose.
 
     This part of the exposures is view-dependent colour, which the spherical harmonics represent. With few cameras only
-    the main directions are removed, at most one for every four cameras.
+    the principal directions are removed, at most one for every four cameras.
     """
     count = len(cameras)
     position, forward = (x.double().cpu() for x in (centres(cameras.viewmats), cameras.viewmats[:, 2, :3]))
@@ -231,7 +231,7 @@ def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
 class _Steps:
     """Consecutive steps of the fit, each on one photo.
 
-    `schedule` holds for each step the view and the numbers of `_Draw` that follow it.
+    `schedule` has for each step the index of the view and the fields of `_Draw` after `row`.
     """
 
     def __init__(self, fit: _Fit, targets: Sequence[_Targets], schedule: Sequence[tuple[int | float, ...]]):
@@ -249,8 +249,10 @@ class _Steps:
 
 
 class _CapturedSteps(_Steps):
-    """The same on CUDA. A step is one launch of a graph, which reads its row of the schedule on the GPU; there is a
-    graph for each size of photos."""
+    """Consecutive steps on a GPU, as CUDA graphs.
+
+    A step is one launch of a graph, which reads its row of the schedule on the GPU; each size of photos has a graph.
+    """
 
     def run(self, bar: tqdm) -> None:
         """Take all steps."""
@@ -263,7 +265,7 @@ class _CapturedSteps(_Steps):
         for step, (group, _) in enumerate(self.places):
             if group.size in self.graphs:
                 self.graphs[group.size].replay()
-            else:  # kernels are loaded in the first step, which cannot be captured
+            else:  # the first step loads kernels, which cannot be captured
                 self._step(group)
                 self._capture(group)
             bar.update()
@@ -274,7 +276,7 @@ class _CapturedSteps(_Steps):
                     self.graphs.clear()
 
     def _count_pairs(self) -> Capacity:
-        """Room for the pairs of Gaussian and tile of any view as the Gaussians are now, and more."""
+        """Capacity for the pairs of Gaussian and tile of any view of the present Gaussians, with a reserve."""
         with torch.no_grad():
             g, groups = self.fit.gaussians(), {group.size: group for group, _ in self.places}
             pairs = [count_pairs(g, camera, *size) for size, group in groups.items() for camera in group.cameras]
@@ -290,7 +292,7 @@ class _CapturedSteps(_Steps):
 
 
 def _descend(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None = None) -> Float[Tensor, ""]:
-    """One step on the drawn photo of the group; returns the loss before it."""
+    """Take one step on the drawn photo of the group; returns the loss before the step."""
     loss = _loss(fit, group, draw, pairs)
     grads = dict(zip(fit.values, torch.autograd.grad(loss, list(fit.values.values())), strict=True))
     fit.gradients += grads["means"].norm(dim=1)
@@ -299,10 +301,10 @@ def _descend(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None = N
 
 
 def _loss(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None) -> Float[Tensor, ""]:
-    """Loss of the render of one photo, without the Gaussians that are left out, in front of a grey background."""
+    """Loss of the render of one photo, with dropout, in front of a grey background."""
     photo, camera = group.images.index_select(0, draw.row)[0], group.cameras.index_select(0, draw.row)[0]
     gaussians, gain = fit.gaussians(), (group.exposures.index_select(0, draw.row)[0] @ fit.values["gains"]).exp()
-    kept = ((fit.lots + draw.lot) % 1 >= draw.dropout) / (1 - draw.dropout)  # others are more opaque instead
+    kept = ((fit.lots + draw.lot) % 1 >= draw.dropout) / (1 - draw.dropout)  # kept ones are more opaque
     shown = replace(gaussians, opacities=gaussians.opacities * kept)
     rgb, alpha, depth, *_ = rasterise_packed(shown, camera, *group.size, draw.grey.expand(3), pairs)
     inverse = None if group.inverse is None else group.inverse.index_select(0, draw.row)[0]
@@ -314,8 +316,8 @@ def _loss(fit: _Fit, group: _Targets, draw: _Draw, pairs: Capacity | None) -> Fl
 def _split(fit: _Fit, generator: torch.Generator) -> None:
     """Prune transparent Gaussians and split those with the largest gradients into two smaller ones.
 
-    As sec. 5.2 of Kerbl et al. 2023, but ranked by the gradient of the mean times the size of the Gaussian: the change
-    of the loss if it moved by its own width.
+    As in Kerbl et al. 2023, sec. 5.2, but ranked by the gradient of the mean times the size of the Gaussian, which is
+    the change of the loss if it moved by its own width.
     """
     v = {name: value.detach() for name, value in fit.values.items()}
     alive = v["opacities"].sigmoid() > DENSITY.min_opacity
@@ -340,7 +342,7 @@ def _rotate(quats: Float[Tensor, "n 4"], vectors: Float[Tensor, "n 3"]) -> Float
 
 
 def _prune(fit: _Fit, views: Views, visible: Bool[Tensor, "n"]) -> Gaussians:
-    """The Gaussians without those that are transparent, in no photo, too large, or right in front of a camera."""
+    """Remove Gaussians that are transparent, not visible in any photo, too large or too close to a camera."""
     done = fit.gaussians()
     done = replace(done, quats=F.normalize(done.quats, dim=1))
     done = Gaussians(*(getattr(done, field.name).detach().cpu() for field in fields(Gaussians)))
@@ -360,9 +362,9 @@ def score_views(
     exposed: bool = False,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[float, float]:
-    """Mean PSNR [dB] and SSIM of the renders of the views `index` compared with their photos.
+    """Mean PSNR [dB] and SSIM of the renders of the views `index`, compared with their photos.
 
-    `exposed`: each render is first multiplied by the factor per channel that fits its photo best.
+    `exposed`: each render is first multiplied by the factor per channel that fits its photo best (least squares).
     """
     psnrs, ssims = [], []
     gaussians = gaussians.to(device)

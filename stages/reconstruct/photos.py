@@ -1,4 +1,4 @@
-"""Photos as taken, and undistorted views of them."""
+"""Photos as taken, their undistorted views, and the result of a reconstruction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stages.core.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos as taken, large ones reduced; sizes may differ."""
+    """Photos as taken, but large ones are reduced; sizes may differ."""
 
     images: tuple[UInt8[Tensor, "h w 3"], ...]
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class Reconstruction:
 
 
 def split_holdout(count: int, holdout: int) -> tuple[list[int], list[int]]:
-    """Indices of the photos to fit and of every `holdout`-th, kept out; a single photo is fitted."""
+    """Indices of the photos to fit, and of every `holdout`-th photo, which is held out; a single photo is fitted."""
     held_out = [i for i in range(count) if holdout and i % holdout == 0] if count > 1 else []
     return [i for i in range(count) if i not in held_out], held_out
 
@@ -82,7 +82,7 @@ def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: in
     """Pinhole views of the photos named in `cameras`, at most `side` wide or high.
 
     `cameras` are in pixels of `photos`. The new K is chosen so that every pixel of a view is inside the photo. The
-    cameras of the views remember the photos, in pixels of their files.
+    cameras of the views also store the intrinsics of the photos, in pixels of their files.
     """
     row = {name: i for i, name in enumerate(photos.names)}
     images, Ks, sizes, photo_Ks, file_sizes = [], [], [], [], []
@@ -109,4 +109,4 @@ def _pinhole_K(K: Float[Tensor, "3 3"], lens: Float[Tensor, "5"], size: tuple[in
     if not lens.any():
         return K
     new, _ = cv2.getOptimalNewCameraMatrix((K.double() - HALF_PIXEL).numpy(), lens.double().numpy(), size, 0)
-    return torch.from_numpy(new) + HALF_PIXEL  # in double precision: rounded once, when stored
+    return torch.from_numpy(new) + HALF_PIXEL  # double precision; rounded only once, when stored

@@ -1,4 +1,4 @@
-"""Point maps of a network -> cameras with intrinsics, and depth maps of confident pixels."""
+"""Conversion of a network's point maps to cameras with intrinsics, and to depth maps of confident pixels."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from stages.reconstruct.depth import DepthMap, look_up_points, unproject
 from stages.reconstruct.network_input import resize_bytes
 from stages.reconstruct.photos import Views
 
-MIN_CONFIDENCE = 0.1  # of the network, for a pixel to be used
-MAX_DEPTH_JUMP = 0.03  # depth range in 3 x 3 pixels, relative to the depth
-DEPTH_TOLERANCE = 0.03  # of consistent depths in two views, relative
-MAX_CHECK_VIEWS = 8  # nearest views that each view is checked against
+MIN_CONFIDENCE = 0.1  # smallest confidence of the network for a pixel to be used
+MAX_DEPTH_JUMP = 0.03  # largest range of depth in 3 x 3 pixels of a surface, relative to the depth
+DEPTH_TOLERANCE = 0.03  # largest relative difference of consistent depths in two views
+MAX_CHECK_VIEWS = 8  # number of nearest views that each view is checked against
 
 
 def solve_intrinsics(
@@ -27,8 +27,8 @@ def solve_intrinsics(
 ) -> Float[Tensor, "3 3"]:
     """Least-squares K [px] that projects the points of a view, in camera axes, to their pixels.
 
-    The principal point is the image centre; fx and fy are fitted over the pixels in `mask`. Pixel centres are at
-    +`centre`; the published code has them at 0.
+    The principal point is the image centre; fx and fy are fitted over the pixels in `mask`. `centre` is the offset of
+    pixel centres, which is 0 in the published code.
     """
     height, width = points.shape[:2]
     y, x = torch.meshgrid(*(torch.arange(s, device=points.device) + centre for s in (height, width)), indexing="ij")

@@ -1,4 +1,4 @@
-"""The scale reference given by the user; photos alone have no absolute scale."""
+"""The user's scale reference, since photos alone have no absolute scale."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ USAGE = (
 
 @dataclass(frozen=True)
 class ScaleReference:
-    """A measured length: between the cameras of two photos, or the median from the cameras to their focus."""
+    """A measured length: distance between the cameras of two photos, or median distance of cameras from the focus."""
 
     distance: float  # [m]
     photos: tuple[str, ...]  # two names, or empty
@@ -32,9 +32,9 @@ class ScaleReference:
             raise InputError(f"--scale-reference: no camera found for {', '.join(absent)}; name photos that are used")
 
     def in_scene_units(self, cameras: Cameras, camera_distance: float) -> float:
-        """The same length in the units of the cameras; `camera_distance` is that from their focus.
+        """The same length in the units of the cameras; `camera_distance` is their median distance from the focus.
 
-        Raises InputError where a photo has no camera or both were taken from nearly the same position.
+        Raises InputError if a photo has no camera or both were taken from nearly the same position.
         """
         from stages.core.geometry.cameras import centres
 

@@ -2,8 +2,8 @@
 
 Results are reproducible for a seed on the same machine: feature extraction and matching are deterministic, RANSAC is
 seeded, and verification and mapping run on one thread, since the order of floating-point sums depends on scheduling.
-Self-calibration of few photos may end in a wrong focal length; where it is not known, they are mapped from two starts,
-of which the better one counts.
+Self-calibration of few photos may converge to a wrong focal length. If a focal length is unknown, the photos are mapped
+from two initial values, and the better model is kept.
 Source: Schönberger and Frahm 2016, "Structure-from-motion revisited".
 """
 
@@ -35,15 +35,15 @@ from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
-MIN_FITTING = 0.2  # smallest share of the matches that given cameras must explain
-MIN_IMAGE_MOTION = 0.005  # median displacement of matches of a camera that moves [photo sizes]
-MAX_MAPPED_TWICE = 40  # photos; another mapping of 50 takes half a minute
+MIN_FITTING = 0.2  # smallest fraction of the matches that given cameras must explain
+MIN_IMAGE_MOTION = 0.005  # smallest median displacement of matches of a moving camera [photo size]
+MAX_MAPPED_TWICE = 40  # most photos that are mapped twice; another mapping of 50 photos takes half a minute
 CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Registered cameras, sparse points, and k observations of points by cameras."""
+    """Registered cameras, m sparse points, and k observations of points by cameras."""
 
     cameras: Cameras
     lenses: LensDistortion
@@ -59,21 +59,22 @@ def estimate_cameras(
     options: MatchingOptions = MatchingOptions(),  # noqa: B008 -- frozen
     steps: StepCache | None = None,
 ) -> SparseModel:
-    """Cameras of as many photos as can be registered.
+    """Estimate cameras and sparse points, for as many photos as can be registered.
 
-    Raises InputError, with what to change, where the photos do not match, the camera is stationary, or mapping fails.
+    Raises InputError, with advice, if the photos do not match, the camera is stationary, or mapping fails; and
+    MissingPackage without pycolmap.
     """
     steps = steps or StepCache()
     _load_pycolmap(options.seed)
     types = (SparseModel, Cameras, LensDistortion)
     once = all(photos.focals) or len(photos) > MAX_MAPPED_TWICE
-    with nullcontext() if once else second_process() as second:  # it has started when it is needed
+    with nullcontext() if once else second_process() as second:  # starts during the matching
         database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
         return steps.cached("model", lambda: _run_mapper(photos, database, options.seed, second), types)
 
 
 def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess | None) -> SparseModel:
-    """The best model that COLMAP maps from the database, from another focal length too if there is a second process."""
+    """The best model that COLMAP maps from the database; a second process maps it from another focal length."""
     pairs = matching.verified_pairs(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
@@ -99,14 +100,15 @@ def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess
 
 
 def _quality(model) -> tuple[int, float]:
-    """By which models from several starts are compared: photos, then the mean reprojection error (wrong focal lengths
-    give more points, as tracks break).
+    """Sort key of models: number of photos, then the mean reprojection error.
+
+    The number of points is not used: with a wrong focal length there are more points, as tracks break.
     """
     return model.num_reg_images(), -model.compute_mean_reprojection_error()
 
 
 def _mapped_from_starts(photos: Photos, database: Path, seed: int, second: SecondProcess | None) -> list[list]:
-    """The models from the first of FOCAL_STARTS, and with a second process those from the second one, side by side."""
+    """Models mapped from the first of FOCAL_STARTS and, in parallel in a second process, from the second one."""
     starts = FOCAL_STARTS if second else FOCAL_STARTS[:1]
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -121,7 +123,7 @@ def _mapped_from_starts(photos: Photos, database: Path, seed: int, second: Secon
 
 
 def _mapped(photos: Photos, database: Path, seed: int, progress: Callable, process: Popen | None = None) -> list:
-    """The pycolmap models of photos that COLMAP's incremental mapper can join."""
+    """Run COLMAP's incremental mapper; returns a pycolmap model for each connected set of photos."""
     import pycolmap
 
     with tempfile.TemporaryDirectory() as folder:
@@ -131,7 +133,7 @@ def _mapped(photos: Photos, database: Path, seed: int, progress: Callable, proce
 
 
 def _failure_reason(photos: int, pairs: int) -> str:
-    """Why mapping failed, by the number of matching pairs: too little overlap, or misleading matches."""
+    """The likely reason why mapping failed, from the number of matching pairs: little overlap or wrong matches."""
     if pairs < 2 * photos:
         what = "the photos overlap too little to find where they were taken from"
         return f"{what}; {CAPTURE_ADVICE}, or give known cameras (--cameras)"
@@ -176,9 +178,9 @@ def triangulate(
     photos: Photos, cameras: Cameras, lenses: LensDistortion,
     options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None,  # noqa: B008 -- frozen
 ) -> SparseModel:  # fmt: skip
-    """Sparse points for known cameras; `photos` and `cameras` in the same order, K in pixels of the photos.
+    """Triangulate sparse points with known cameras, in the order of the photos and with K in their pixels.
 
-    Raises InputError where the cameras do not fit the photos or these overlap too little.
+    Raises InputError if the cameras do not fit the photos or the photos overlap too little.
     """
     steps = steps or StepCache()
     pycolmap = _load_pycolmap(options.seed)
@@ -218,7 +220,7 @@ def triangulate(
 
 
 def _load_pycolmap(seed: int) -> ModuleType:
-    """The package pycolmap, its log silenced and its random numbers seeded; MissingPackage where absent."""
+    """Import pycolmap, silence its log and seed its random numbers. Raises MissingPackage if it is absent."""
     try:
         pycolmap = import_pycolmap()
     except ImportError as error:
@@ -230,7 +232,7 @@ def _load_pycolmap(seed: int) -> ModuleType:
 
 
 def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
-    """A SparseModel from a COLMAP model, photos in order of name."""
+    """Convert a COLMAP model to a SparseModel, with photos sorted by name."""
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     row = {image.image_id: i for i, image in enumerate(images)}
     viewmats, Ks, sizes, lenses = [], [], [], []

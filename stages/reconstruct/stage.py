@@ -47,10 +47,10 @@ class Report:
 def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions()) -> Report:  # noqa: B008 -- frozen
     """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 
-    With `options.sequence` the folder has a film of each camera: their frames at the release are reconstructed.
+    With `options.sequence` the folder has a film of each camera, and the frames at the release are reconstructed.
 
-    Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it
-    for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
+    Results of finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run
+    leaves it for `options.resume`. Raises InputError for unsuitable photos or options, and then deletes the folder.
     """
     began, backend = time.monotonic(), choose(BACKENDS, "--backend", options.backend)
     check_output(Path(out), "scene")
@@ -82,7 +82,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
 
 
 def _cache_key(photos: Photos, options: ReconstructOptions) -> str:
-    """Fingerprint of everything that the results of the steps depend on."""
+    """Fingerprint of everything on which the results of the steps depend."""
     cameras = [(p.name, sha256(p)) for p in _camera_files(options.cameras)]
     return fingerprint(
         ngff_version(), replace(options, resume=False), photos.names, photos.focals, cameras, *photos.images

@@ -1,4 +1,4 @@
-"""Results and wall time of the steps of a reconstruction, kept to resume an interrupted run."""
+"""Cache of the results of the steps of a reconstruction, to resume an interrupted run, and their wall times."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ T = TypeVar("T")
 class StepCache:
     """A folder with the result of every finished step, written atomically.
 
-    `key` identifies everything that the results depend on; results of another key, or without `resume`, are deleted.
-    Without a folder a temporary one is used, deleted with this object.
+    `key` identifies everything on which the results depend. Results with another key are deleted, and all results
+    without `resume`. Without a folder a temporary one is used, which is deleted with this object.
     """
 
     def __init__(self, folder: Path | None = None, key: str = "", resume: bool = False):
@@ -57,14 +57,17 @@ class StepCache:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def cached(self, name: str, make: Callable[[], T], types: tuple[type, ...] = ()) -> T:
-        """The result of `make`, or that of the resumed run. It may hold tensors, plain values and `types`."""
+        """The result of `make`, or that of the resumed run. It may contain tensors, plain values and `types`.
+
+        Raises InputError if the stored result is damaged.
+        """
         path = self.folder / f"{name}.pt"
         if path.exists():
             log.info("%s: result of the interrupted run", name)
             torch.serialization.add_safe_globals(list(types))
             try:
                 return torch.load(path, weights_only=True)
-            except Exception as error:  # a damaged pickle raises anything
+            except Exception as error:  # a damaged pickle may raise any exception
                 raise InputError(f"{path}: is damaged; start again without --resume") from error
         with self.timed(name):
             made = make()
@@ -72,7 +75,7 @@ class StepCache:
         return made
 
     def cached_file(self, name: str, write: Callable[[Path], None]) -> Path:
-        """Path of the file that `write` writes, or wrote in the resumed run."""
+        """Path of the file that `write` writes, or that it wrote in the run that is resumed."""
         path = self.folder / name
         if path.exists():
             log.info("%s: result of the interrupted run", path.stem)

@@ -1,9 +1,9 @@
-"""When films of the same motion show the same moment, and when the motion begins and ends.
+"""Temporal alignment of films of the same motion, and detection of the release and of the end of the motion.
 
-Offsets are found from the share of the pixels that change between frames, which depends less on the view than how much
-they change: its increments correlate where something falls, lands or stops. The peak of the cross-correlation of a pair
-of films is refined by a parabola, and the offsets of all films are the robust solution of all pairs. With sound, the
-increments of its loudness take the place of that share.
+The signal of a film is the fraction of pixels that change between frames, which depends less on the view than the
+amount of change. Increments of these signals correlate when something falls, lands or stops. The peak of the
+cross-correlation of each pair of films is refined by a parabola, and the offsets of all films are a robust
+least-squares solution over all pairs. With sound, the signal is the loudness.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ import numpy as np
 from stages.core.errors import InputError
 
 log = logging.getLogger(__name__)
-MIN_CHANGE = 0.03  # of a pixel's colour, 0..1, that is no noise
-NOISE_FACTOR = 6.0  # of the median change, which is that of what rests, to the least change that counts
-PAIR_ERROR = 0.3  # of a pair's offset that still counts [frames]
-MIN_CORRELATION = 0.6  # of a film with the others, below which it shows another motion
-MIN_OVERLAP = 0.6  # of two films, of the shorter one
-ROUNDS = 20  # of reweighting
-ONSET = 0.1  # speed at which motion begins or ends, of the highest
-ONSET_FRAMES = 3  # from which the release is extrapolated
+MIN_CHANGE = 0.03  # smallest change of a pixel's colour (0..1) that is not noise
+NOISE_FACTOR = 6.0  # smallest change of a pixel that is not noise, relative to the median change of all pixels
+PAIR_ERROR = 0.3  # scale of the errors of pairwise offsets in the robust weights [frames]
+MIN_CORRELATION = 0.6  # smallest best correlation of a film with others; below it, the film shows another motion
+MIN_OVERLAP = 0.6  # smallest overlap of two films, relative to the shorter one
+ROUNDS = 20  # number of rounds of iterative reweighting
+ONSET = 0.1  # speed at which motion begins or ends, relative to the highest speed
+ONSET_FRAMES = 3  # number of frames from which the release is extrapolated
 FLOOR = 0.1  # quantile of the changes between frames that is taken as noise
 
 
 @dataclass(frozen=True)
 class MotionSignal:
-    """How much of a film moves; entry k is the change from frame k to frame k + 1."""
+    """Amount of motion in a film; entry k is the change from frame k to frame k + 1."""
 
-    share: np.ndarray  # of the pixels that change
-    square: np.ndarray  # mean squared change of a colour, 0..1
+    share: np.ndarray  # fraction of the pixels that change
+    square: np.ndarray  # mean squared change of the colours (0..1)
 
     @property
     def speed(self) -> np.ndarray:
-        """Root mean square change beyond that of noise."""
+        """Root mean square change, without noise."""
         return np.sqrt(np.maximum(self.square - np.quantile(self.square, FLOOR), 0))
 
 
 def motion_signal(frames: Sequence[np.ndarray]) -> MotionSignal:
-    """The signal of the frames (h, w, 3) of a film, 0..255, which may be small."""
+    """The signal of a film with frames (h, w, 3), 0..255; small frames are sufficient."""
     if len(frames) < 2:
         return MotionSignal(np.zeros(0), np.zeros(0))
     changes = np.stack([np.sqrt(np.square((b.astype(np.float32) - a) / 255).mean(-1))
@@ -52,10 +52,10 @@ def motion_signal(frames: Sequence[np.ndarray]) -> MotionSignal:
 
 
 def find_offsets(signals: dict[str, np.ndarray], rate: float = 1.0) -> dict[str, float]:
-    """How much later than the first each film shows the same moment [frames], of signals with `rate` entries a frame.
+    """Offset [frames] by which each film shows the same moment later than the first film.
 
-    Films that do not correlate with the others are left out, with a warning. Raises InputError where fewer than two
-    are left.
+    `signals` have `rate` entries per frame. Films that do not correlate with the others are left out, with a warning.
+    Raises InputError if fewer than two are left.
     """
     names, found = list(signals), {}
     for i, a in enumerate(names):
@@ -73,7 +73,7 @@ def find_offsets(signals: dict[str, np.ndarray], rate: float = 1.0) -> dict[str,
 
 
 def _lag(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """By how much b is later than a, with a parabola through the peak, and their correlation there."""
+    """Lag of b relative to a, at the peak of their normalised cross-correlation refined by a parabola; and the peak."""
     if min(len(a), len(b)) < 3:
         return 0.0, 0.0
     ones = [np.ones_like(x) for x in (a, b)]
@@ -90,7 +90,7 @@ def _lag(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def _solve(count: int, rows: list[tuple[int, int, float, float]], tolerance: float) -> np.ndarray:
-    """Offsets whose differences agree with those of most pairs (i, j, offset i - offset j, correlation)."""
+    """Robust offsets from pairs (i, j, offset i - offset j, correlation), by iteratively reweighted least squares."""
     A, b, weight = np.zeros((len(rows), count)), np.array([r[2] for r in rows]), np.array([r[3] for r in rows])
     for row, (i, j, *_) in enumerate(rows):
         A[row, i], A[row, j] = 1, -1
@@ -103,10 +103,10 @@ def _solve(count: int, rows: list[tuple[int, int, float, float]], tolerance: flo
 
 
 def find_motion(signals: dict[str, MotionSignal], offsets: dict[str, float]) -> tuple[float, float]:
-    """Release and rest [frames of a film with offset 0]: medians over the films that show the motion.
+    """Times of release and rest [frames of a film with offset 0]: medians over the films that show the motion.
 
-    The release is where the speed of the first frames in which motion is seen extrapolates to 0.
-    Raises InputError where nothing moves.
+    The speed in the first frames with motion is extrapolated to 0, which is the release. Raises InputError if nothing
+    moves.
     """
     begins, ends = [], []
     for name, offset in offsets.items():
@@ -114,10 +114,10 @@ def find_motion(signals: dict[str, MotionSignal], offsets: dict[str, float]) -> 
         if not len(speed) or not speed.max() > 0:
             continue
         moves = np.flatnonzero(speed > ONSET * speed.max())
-        # the first of several in a row
+        # first of ONSET_FRAMES consecutive frames with motion
         first = next((k for k in moves if (speed[k : k + ONSET_FRAMES] > ONSET * speed.max()).all()), moves[0])
         k = np.arange(first, min(first + ONSET_FRAMES, len(speed)))
-        # time as a polynomial of speed, which grows more slowly once textures move by more than their grain
+        # time is fitted as a polynomial of speed, which grows more slowly once textures move by more than their grain
         rising = len(k) == ONSET_FRAMES and (np.diff(speed[k]) > 0).all()
         start = float(np.polyval(np.polyfit(speed[k], k + 0.5, len(k) - 1), 0.0)) if rising else float(first)
         begins.append(min(max(start, first - 2.0), first + 1.0) - offset)
@@ -128,7 +128,7 @@ def find_motion(signals: dict[str, MotionSignal], offsets: dict[str, float]) -> 
 
 
 def parse_offsets(text: str, names: Sequence[str]) -> dict[str, float]:
-    """Offsets given as "A.mp4=0,B.mp4=3.33" [frames]; InputError for other texts, and unknown or missing films."""
+    """Parse offsets "A.mp4=0,B.mp4=3.33" [frames]. Raises InputError for other texts and unknown or missing films."""
     offsets = {}
     for part in text.split(","):
         name, _, value = part.strip().rpartition("=")

@@ -1,4 +1,4 @@
-"""The world frame: up direction, supporting plane and scale of the scene."""
+"""Estimation of the world frame: up direction, supporting plane and scale of the scene."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from stages.core.geometry.planes import Plane, ransac
 from stages.core.geometry.similarity import Similarity
 from stages.reconstruct.options import UP_SIDES
 
-# Minimum cosine of the cameras' pitch and minimum fraction of the points in focus, tried in this order.
+# Minimum component of a plane's normal along the cameras' up axes (cosine of their pitch), and minimum weighted
+# fraction of the points on the plane; pairs are tried in this order.
 PLANE_CRITERIA = ((0.5, 0.04), (0.05, 0.3))
-UPRIGHT_FACTOR = 1.5  # of a plane's share of points, if the photos are upright for it; squared if they look down on it
-LOOKS_DOWN = 0.25  # sine of the mean pitch of cameras that are taken to look down
-ROLL_RATIO = 4.0  # of the spreads of the cameras' axes, from which one of them is the horizontal one
-# Band around the first plane in which it is fitted again, and side of a surface patch [camera distances].
+UPRIGHT_FACTOR = 1.5  # weight of a plane's fraction of points if photos are upright; squared if cameras look down on it
+LOOKS_DOWN = 0.25  # sine of the smallest mean pitch of cameras that look down
+ROLL_RATIO = 4.0  # smallest ratio of the least spreads of the cameras' x and y axes if one of them is horizontal
+# Depth below and height above the first plane of the band in which it is refitted, and side of a patch of the surface
+# [camera distances].
 BAND_BELOW, BAND_ABOVE, PATCH_SIZE = 0.08, 0.03, 0.04
 
 
@@ -30,10 +32,10 @@ class Ground:
     up: Float[Tensor, "3"]
     plane: Plane | None  # supporting plane with normal `up`, if there is one
     focus: Float[Tensor, "3"]  # the point that the cameras look at
-    radius: float  # median distance of the cameras from it
-    inlier_fraction: float = 0.0  # of the points in focus, on the plane
-    up_side: str = "top"  # of the photos: which of their sides is up
-    rival: str = ""  # another side that may be up as well
+    radius: float  # median distance of the cameras from `focus`
+    inlier_fraction: float = 0.0  # fraction of the points, weighted by focus, that are on the plane
+    up_side: str = "top"  # side of the photos that is up
+    rival: str = ""  # another side that may be up instead; empty if the choice is clear
 
 
 def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"]) -> Float[Tensor, "3"]:
@@ -46,10 +48,10 @@ def find_ground(
     points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int = 0,
     up_side: str = "auto",
 ) -> Ground:  # fmt: skip
-    """The supporting plane of the objects in focus, or only the up direction of the cameras.
+    """Find the supporting plane of the objects in focus; without one, only the up direction from the cameras.
 
-    `up_side` is the side of the photos that is up, one of UP_SIDES. With "auto" it is a side that the roll of the
-    cameras allows, and of these the one whose plane has most points in focus, weighted by UPRIGHT_FACTOR.
+    `up_side` is the side of the photos that is up, one of UP_SIDES. With "auto" the sides that are compatible with the
+    roll of the cameras are tried; the one whose plane has most points in focus, weighted by UPRIGHT_FACTOR, is chosen.
     """
     sides, looks_down = _sides_by_roll(viewmats) if up_side == "auto" else ((up_side,), "")
     found = {side: replace(_find_ground(points, turned(viewmats, side), focus, seed), up_side=side) for side in sides}
@@ -63,14 +65,14 @@ def find_ground(
 
 
 def _sides_by_roll(viewmats: Float[Tensor, "c 4 4"]) -> tuple[tuple[str, ...], str]:
-    """Sides of the photos that may be up, and which of them is if the cameras look down ("" where that is unknown).
+    """Sides of the photos that may be up, and the one that is up if the cameras look down ("" if unknown).
 
-    Cameras that move around a scene turn about the vertical: one of the axes of their pictures stays horizontal, that
-    is, orthogonal to one direction, while the other does not.
+    Cameras that move around a scene rotate about the vertical: one of their image axes stays horizontal, that is,
+    orthogonal to a common direction, while the other does not.
     """
     right, down, ahead = (viewmats[:, axis, :3] for axis in range(3))
     (flat, wide), (upright, other) = (torch.linalg.eigh(axis.mT @ axis / len(axis)) for axis in (right, down))
-    spans = float(min(flat[1], upright[1])) > 0.02  # else the cameras are too much alike
+    spans = float(min(flat[1], upright[1])) > 0.02  # otherwise the cameras are too similar
     if not spans or max(flat[0], upright[0]) < ROLL_RATIO * min(flat[0], upright[0]):
         return UP_SIDES, ""
     landscape = bool(flat[0] < upright[0])
@@ -83,7 +85,7 @@ def _sides_by_roll(viewmats: Float[Tensor, "c 4 4"]) -> tuple[tuple[str, ...], s
 
 
 def turned(viewmats: Float[Tensor, "c 4 4"], up_side: str) -> Float[Tensor, "c 4 4"]:
-    """The cameras turned about their optical axes so that `up_side` of their pictures becomes the top."""
+    """Rotate cameras about their optical axes so that `up_side` of their images becomes the top."""
     quarter = torch.eye(4).to(viewmats)
     quarter[:2, :2] = torch.tensor([[0.0, 1], [-1, 0]])  # the right side becomes the top
     return torch.linalg.matrix_power(quarter, UP_SIDES.index(up_side)) @ viewmats
@@ -92,11 +94,11 @@ def turned(viewmats: Float[Tensor, "c 4 4"], up_side: str) -> Float[Tensor, "c 4
 def _find_ground(
     points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int
 ) -> Ground:
-    """The plane by RANSAC, with cameras that are held upright.
+    """Find the supporting plane by RANSAC, for cameras that are held upright.
 
     Points are weighted by their distance from the focus, so that a table is preferred to the floor around it; most
-    cameras must be above the plane. Planes that the cameras look down on by less than 60 degrees are tried first, since
-    steeper ones may be the front of a book; a steeper one needs more points.
+    cameras must be above the plane. Planes on which the cameras look down by less than 60 degrees are tried first:
+    steeper ones may be the front of a book, and need more points.
     """
     eyes = centres(viewmats)
     radius = float((eyes - focus).norm(dim=1).median())
@@ -114,10 +116,11 @@ def _find_ground(
 
 
 def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Ground:
-    """The supporting plane fitted again with equal weight for equal area instead of for each point.
+    """Refit the supporting plane with weights by area instead of by number of points.
 
     Textured objects, such as a keyboard and a book, may have more points than the table under them and tilt the first
-    plane. The band of points extends less far above the plane than below, since points above may be on a tray.
+    plane. Only points in a band are used, which extends less far above the plane than below, since points above may be
+    on a tray.
     """
     if ground.plane is None:
         return ground
@@ -132,7 +135,7 @@ def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -
 
 
 def _focus_weights(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radius: float) -> Float[Tensor, "n"]:
-    """Weights of points, 1 at the focus and 1/2 at half the cameras' distance from it."""
+    """Weights of points by their distance from the focus: 1 at the focus, 1/2 at half the cameras' distance."""
     return 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
 
 
@@ -143,16 +146,16 @@ def _plausible_up(normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"
     up axes of the cameras is at least `min_up`, and the cameras do not look up at the plane.
     """
     right, down, ahead = (viewmats[:, axis, :3] for axis in range(3))
-    roll = (normals @ right.mT).abs().median(1).values  # sine of the angle the camera is rolled by
+    roll = (normals @ right.mT).abs().median(1).values  # sine of the roll angle
     upward = (-normals @ down.mT).median(1).values
     pitch = (normals @ ahead.mT).median(1).values
     return (roll < 0.3) & (upward > min_up) & (pitch < 0.2)
 
 
 def up_from_cameras(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
-    """Up direction from the cameras: orthogonal to their horizontal axes if these span a plane, else their mean up.
+    """Up direction from the cameras: orthogonal to their x axes if these span a plane, otherwise the mean up axis.
 
-    The mean up of cameras that all look down from one side is tilted, so it is only the fallback.
+    The mean up axis of cameras that all look down from one side is tilted, so it is only the fallback.
     """
     right = viewmats[:, 0, :3]
     mean = F.normalize(-viewmats[:, 1, :3].mean(0), dim=0)
@@ -164,7 +167,7 @@ def up_from_cameras(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
 
 
 def _lowest_parallel_plane(points, weights, plane: Plane, threshold: float) -> tuple[Plane, Bool[Tensor, "n"]]:
-    """The lowest parallel plane with half the weight of this one or more (the table under a mat), and its inliers."""
+    """The lowest parallel plane with at least half the weight of `plane`, and its inliers: the table under a mat."""
     heights = plane.heights(points)
     weight = weights[heights.abs() < threshold].sum()
     in_focus = weights > 0.5  # excludes the floor under a table
@@ -182,8 +185,8 @@ def to_world(
 ) -> Similarity:
     """Transform to the world frame: z up, supporting plane at z = 0, focus at x = y = 0, first camera on the -y side.
 
-    Without a plane, z = 0 is the 2 % quantile of the heights near the focus. The scale is kept for given cameras
-    (`metric`), otherwise the median distance of the cameras from the focus becomes 1.
+    Without a plane, z = 0 is the 2 % quantile of the heights near the focus. For given cameras (`metric`) the scale is
+    kept; otherwise the median distance of the cameras from the focus becomes 1.
     """
     scale = 1.0 if metric else 1 / ground.radius
     to_focus = ground.focus - centres(viewmats)[0]

@@ -1,1 +1,1 @@
-"""scene.ply to scene.ply with object ids."""
+"""Segmentation: scene.ply -> scene.ply with object ids."""

@@ -1,7 +1,8 @@
-"""The boxes backend: objects from bounding boxes in the first view, segmented by colour in each view, then voted.
+"""The boxes backend: objects in bounding boxes of the first view, segmented by colour in each view.
 
-Each segmented view adds votes to the Gaussians; the votes so far initialise the segmentation of the next view, in the
-order of distance from the first. Source of the segmentation: Rother, Kolmogorov and Blake 2004, "GrabCut", in OpenCV.
+Each segmented view adds votes to the Gaussians. The votes so far initialise the segmentation of the next view; views
+are visited by their distance from the first. Views are segmented by GrabCut in OpenCV (Rother, Kolmogorov and Blake
+2004, "GrabCut").
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from stages.core.scene.scene import Scene
 from stages.segment.options import NETWORKS, SegmentOptions
 from stages.segment.prompts import read_prompts
 
-MAX_VIEWS = 32  # that are segmented; more are redundant
-COLOUR_BINS = 32  # per channel of a colour histogram
-MIN_LIKELIHOOD_RATIO = 2.5  # frequency of an object's colour in the box, relative to around it
-CONTEXT_WIDTH = 0.5  # width of the frame around a box that is compared with it [longer side of the box]
-MAX_SHIFT_KNOWN = 0.1  # distance of a pixel from an object's predicted mask [square root of its area]
-MAX_SHIFT_UNSEEN = 0.5  # the same where no earlier view showed the surface
-MIN_LABELLED_PIXELS = 20  # of an object that is segmented in another view
+MAX_VIEWS = 32  # most views that are segmented; more are redundant
+COLOUR_BINS = 32  # bins per channel of a colour histogram
+MIN_LIKELIHOOD_RATIO = 2.5  # smallest ratio of the frequencies of an object's colour in the box and around it
+CONTEXT_WIDTH = 0.5  # width of the frame around a box with which the box is compared [longer side of the box]
+MAX_SHIFT_KNOWN = 0.1  # largest distance of an object's pixel from its predicted mask [square root of the mask's area]
+MAX_SHIFT_UNSEEN = 0.5  # largest distance for surfaces that no earlier view showed [square root of the mask's area]
+MIN_LABELLED_PIXELS = 20  # fewest predicted pixels of an object that is segmented in a further view
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """The object in each box; all else is background. One view is in memory at a time.
+    """Label the object in each box; everything else is background. Only one view is in memory at a time.
 
-    Raises InputError for a scene without cameras, prompts without boxes, and boxes outside of the first view.
+    Raises InputError for a scene without cameras, prompts without boxes, and boxes outside the first view.
     """
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--boxes: the scene has no cameras; use one that `ngff reconstruct` wrote")
@@ -63,7 +64,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def nearest_first(scene: Scene) -> list[int]:
-    """The first view and at most MAX_VIEWS - 1 evenly chosen others, by distance from it."""
+    """The first view and at most MAX_VIEWS - 1 evenly chosen others, sorted by distance from the first."""
     eyes = centres(scene.cameras.viewmats)
     order = (eyes - eyes[0]).norm(dim=1)
     order[0] = -1
@@ -74,7 +75,7 @@ def nearest_first(scene: Scene) -> list[int]:
 def segment_prompted_view(
     image: UInt8[np.ndarray, "h w 3"], boxes_fraction: Float[Tensor, "o 4"], seed: int
 ) -> Int[np.ndarray, "h w"]:
-    """Labels of the view that the boxes refer to. Where boxes overlap, the smallest is segmented first."""
+    """Labels of the view to which the boxes refer. Smaller boxes are segmented first and win where boxes overlap."""
     height, width = image.shape[:2]
     labels = np.zeros((height, width), dtype=np.int64)
     boxes = (boxes_fraction * torch.tensor([width, height, width, height])).round().long()
@@ -86,7 +87,7 @@ def segment_prompted_view(
         inside[y0:y1, x0:x1] = True
         inside &= labels == 0
         likely = inside & (colour_likelihood_ratio(image, inside, near & ~inside) > MIN_LIKELIHOOD_RATIO)
-        if not likely.any():  # same colours as around it: starts from the whole box
+        if not likely.any():  # same colours inside and outside: start from the whole box
             likely = inside
         labels[grabcut(image, inside & ~likely, likely, np.zeros_like(inside), seed)] = i + 1
     return labels
@@ -95,7 +96,7 @@ def segment_prompted_view(
 def colour_likelihood_ratio(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
-    """Ratio of the frequencies of each pixel's colour inside and around, from smoothed CIELAB histograms."""
+    """Ratio of the frequencies of each pixel's colour in both masks, from smoothed CIELAB histograms."""
     lab = cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 1), cv2.COLOR_RGB2LAB).astype(np.int64) * COLOUR_BINS // 256
     key = (lab * (COLOUR_BINS**2, COLOUR_BINS, 1)).sum(-1)
     frequencies = []
@@ -108,7 +109,7 @@ def colour_likelihood_ratio(
 def segment_next_view(
     image: UInt8[np.ndarray, "h w 3"], footprint: ViewFootprint, votes: Float[Tensor, "n k"], seed: int
 ) -> Int[np.ndarray, "h w"]:
-    """Labels of another view, initialised from the votes of the Gaussians visible in it."""
+    """Labels of a further view, initialised from the votes of the Gaussians that are visible in it."""
     front = footprint.front.long().clamp_min(0)
     known = ((footprint.front >= 0) & (votes.sum(1) > 0)[front]).numpy()
     label = votes.argmax(1)[front].numpy()

@@ -1,4 +1,4 @@
-"""Objects without prompts: a network's mask proposals, filtered to those of objects on the supporting plane."""
+"""Object discovery without prompts: a network's mask proposals, filtered to objects on the supporting plane."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from stages.segment.options import SegmentOptions
 from stages.segment.propagation import MaskTracker, resize_logits
 
 log = logging.getLogger(__name__)
-SEARCHED_VIEWS = 4  # images, evenly spread, that are searched: an object occluded in one is visible in another
-MIN_NESTED_FRACTION = 0.8  # fraction of a mask inside a larger one from which it is a part of that
-MIN_KNOWN_FRACTION = 0.5  # fraction of a mask inside tracked objects from which it is one of them
-MAX_HEIGHT = 0.4  # largest height above the table of an object's lowest points [camera distance]
-MAX_SIZE = 1.2  # longest side of an object [camera distance]
-MIN_POINTS = 20  # visible Gaussians of an object
-MAX_MASK_PIXELS = 5000  # pixels of a mask that are examined
+SEARCHED_VIEWS = 4  # evenly spaced images that are searched; an object occluded in one is visible in another
+MIN_NESTED_FRACTION = 0.8  # fraction of a mask inside a larger one above which it is part of the larger one
+MIN_KNOWN_FRACTION = 0.5  # fraction of a mask inside tracked objects above which it is one of these objects
+MAX_HEIGHT = 0.4  # largest height of an object's lowest points above the table [camera distance]
+MAX_SIZE = 1.2  # largest longest side of an object [camera distance]
+MIN_POINTS = 20  # fewest visible Gaussians of an object
+MAX_MASK_PIXELS = 5000  # about the most pixels of a mask that are tested
 
 
 def discover_objects(
     tracker: MaskTracker, support: Support | None, options: SegmentOptions
 ) -> dict[int, Int[Tensor, "h w"]]:
-    """Label images of all views, by camera: 0 background, 1... the objects, at most `options.max_objects`.
+    """Label images by camera index: 0 is the background, 1... are the objects, at most `options.max_objects`.
 
-    A few images are searched one after the other; new masks are propagated through all images. A new label is
-    merged with an earlier object where it mostly covers that object in the other images.
+    A few images are searched one after the other, and new masks are propagated through all images. A new label is
+    merged with an earlier object if it mostly covers that object in the other images.
     """
     found: dict[int, Tensor] = {}
     count = 0
@@ -55,9 +55,9 @@ def discover_objects(
 def match_labels(
     fresh: dict[int, Int[Tensor, "h w"]], found: dict[int, Int[Tensor, "h w"]], new: int, count: int
 ) -> Int[Tensor, "m"]:
-    """Object number of each new label 0...`new`: that of the known object (of `count`) it mostly covers, or the next.
+    """Object number of each new label 0...`new`: the known object, of `count`, that it mostly covers, or a new number.
 
-    Only images in which both are visible are compared; a label that covers no known object is a new object.
+    Labels and objects are compared only in images in which both are visible.
     """
     shared, area = torch.zeros(2, new + 1, count + 1)
     for view, labels in fresh.items():
@@ -92,7 +92,7 @@ def _object_masks(
 
 
 def is_on_support(scene: Scene, front: Int[Tensor, "p"], support: Support | None, options: SegmentOptions) -> bool:
-    """Whether a mask shows an object on the table; `front` holds the front-most Gaussian of each of its pixels.
+    """Whether a mask shows an object on the table; `front` has the front-most Gaussian of each pixel, or -1.
 
     An object has a plausible size, is mostly over the table and higher than its surface, and its lowest points are
     near the table.
@@ -116,7 +116,7 @@ def is_on_support(scene: Scene, front: Int[Tensor, "p"], support: Support | None
 
 
 def remove_nested_masks(masks: Bool[Tensor, "m h w"]) -> Bool[Tensor, "k h w"]:
-    """Masks that are not part of a larger one, largest first."""
+    """Remove masks that are part of a larger one; the result is sorted, largest first."""
     areas = masks.flatten(1).sum(1)
     kept: list[int] = []
     for i in areas.argsort(descending=True, stable=True).tolist():

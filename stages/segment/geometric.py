@@ -9,6 +9,6 @@ from stages.segment.options import SegmentOptions
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """Objects on the supporting plane."""
+    """Label the objects on the supporting plane."""
     settings = GroupingOptions(options.max_objects, options.min_size, options.detail, options.seed)
     return segment_by_geometry(scene, settings)

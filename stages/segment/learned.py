@@ -10,6 +10,6 @@ from stages.segment.options import SegmentOptions
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """Objects of the scene, largest first, as `ngff simulate` finds them in a scene without labels."""
+    """Label the objects of the scene, largest first; `ngff simulate` does the same for an unlabelled scene."""
     limits = ObjectLimits(options.max_objects, options.min_size)
     return segment_by_network(scene, limits, options.weights, options.seed, pick_device(options.device))

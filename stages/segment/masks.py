@@ -18,13 +18,13 @@ from stages.core.scene.schema import numbered, read_json, reason, texts
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import match_files
 
-MAX_LABELS = 1000  # different numbers in all label images
+MAX_LABELS = 1000  # most different labels in all label images
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """Labels of the images in the folder `options.masks`, projected with visibility and voted over all views.
+    """Label Gaussians by the images in the folder `options.masks`: visible Gaussians get votes from all views.
 
-    Where names.json names the objects but not 255, pixels of that value have no vote, as `ngff evaluate` ignores them.
+    If names.json names objects but not 255, pixels with the value 255 do not vote; `ngff evaluate` ignores them too.
     Raises InputError for a scene without cameras, a folder without matching images, and wrong aspect ratios.
     """
     if scene.cameras is None:
@@ -39,7 +39,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def _columns(labels: Int[Tensor, "h w"], columns: dict[int, int]) -> Int[Tensor, "h w"]:
-    """The labels by their columns in the table of votes; new ones are added to `columns`."""
+    """Map labels to columns of the table of votes; new labels are added to `columns`."""
     numbers, index = labels.unique(return_inverse=True)
     for number in numbers.tolist():
         columns.setdefault(number, len(columns))
@@ -49,7 +49,7 @@ def _columns(labels: Int[Tensor, "h w"], columns: dict[int, int]) -> Int[Tensor,
 
 
 def _labels(scene: Scene, view: int, file: Path, options: SegmentOptions) -> Int[Tensor, "h w"]:
-    """A label image of any size, undistorted; raises InputError unless it has the photo's aspect ratio."""
+    """Read a label image of any size and undistort it. Raises InputError unless it has the photo's aspect ratio."""
     labels = read_labels(file)
     try:
         lens = Undistortion.of(scene.cameras, view, (labels.shape[1], labels.shape[0]), options.undistorted)
@@ -59,7 +59,7 @@ def _labels(scene: Scene, view: int, file: Path, options: SegmentOptions) -> Int
 
 
 def read_names(folder: Path) -> dict[int, str]:
-    """Names by label, from names.json ({"1": "duck"}, {"1": {"name": "duck"}} or ["duck", ...]); empty without it."""
+    """Names by label from names.json: {"1": "duck"}, {"1": {"name": "duck"}} or ["duck", ...]; empty if absent."""
     path = Path(folder) / "names.json"
     if not path.exists():
         return {}

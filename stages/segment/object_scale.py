@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from stages.core.scene.scene import Scene
 
 FORM = re.compile(r"object=(?P<object>[0-9]+)\s+(?P<side>height|length)=(?P<metres>[0-9.eE+-]+)")
-OUTLIER_FRACTION = 0.005  # of an object's Gaussians at either end, which are ignored
+OUTLIER_FRACTION = 0.005  # fraction of an object's Gaussians that is ignored at each end
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ObjectScaleReference:
     metres: float
 
     def applied(self, scene: Scene) -> Scene:
-        """The scene with `metres_per_unit` derived from the object; InputError if it is absent or has no extent."""
+        """The scene with `metres_per_unit` from the object. Raises InputError if it is absent or has no extent."""
         means = scene.gaussians.means[scene.gaussians.object_id == self.object].double()
         if len(means) < 2:
             have = ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
@@ -38,7 +38,7 @@ class ObjectScaleReference:
 
 
 def parse_object_scale(text: str) -> ObjectScaleReference | None:
-    """Parses the command-line form, such as "object=1 height=0.12"; None for an empty text; InputError otherwise."""
+    """Parse a reference such as "object=1 height=0.12"; None for an empty text. Raises InputError for other forms."""
     if not text:
         return None
     found = FORM.fullmatch(text.strip())

@@ -92,7 +92,7 @@ class SegmentOptions:
             raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
         if not 0 < self.detail < 2:
             raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.4")
-        self.renamed, parse_object_scale(self.scale_reference)  # noqa: B018 -- errors are raised before work starts
+        self.renamed, parse_object_scale(self.scale_reference)  # noqa: B018 -- raises errors before work starts
 
     @property
     def _is_network(self) -> bool:
@@ -108,7 +108,7 @@ class SegmentOptions:
 
     @property
     def renamed(self) -> dict[int, str]:
-        """Names given by the user, by object number; raises InputError where they cannot be parsed."""
+        """Names given by the user, by object number. Raises InputError if they cannot be parsed."""
         names = {}
         for part in filter(None, (p.strip() for p in self.names.split(","))):
             number, sign, name = part.partition("=")

@@ -1,4 +1,4 @@
-"""The points backend: the objects at points that the user gives in the photos, by the network of `learned`."""
+"""The points backend: objects at points that the user gives in photos, segmented by the network of `learned`."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ FORM = re.compile(r"(?:view=(?P<view>\S+)\s+)?xy=(?P<x>[0-9.]+),(?P<y>[0-9.]+)(?
 
 @dataclass(frozen=True)
 class PointPrompt:
-    """A point in a photo, and the object that it is on."""
+    """A point on an object in a photo."""
 
-    view: str  # name of the photo, with or without its suffix; empty: the first
+    view: str  # name of the photo, with or without its suffix; empty: the first photo
     xy: tuple[float, float]  # [px]
-    name: str  # of the object; points of one name are on one object
-    text: str  # as given
+    name: str  # of the object; points with the same name are on the same object
+    text: str  # of the option, for error messages
 
 
 def parse_points(texts: tuple[str, ...]) -> list[PointPrompt]:
-    """The points of the command line, such as "view=a.jpg xy=310,220 name=duck"; InputError for another form.
+    """Parse points of the command line, such as "view=a.jpg xy=310,220 name=duck".
 
-    Points without a name are on objects of their own, object_1 and so on.
+    Each point without a name is on an object of its own, object_1 and so on. Raises InputError for other forms.
     """
     out = []
     for text in texts:
@@ -53,10 +53,10 @@ def parse_points(texts: tuple[str, ...]) -> list[PointPrompt]:
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """The objects at the points; all else is background.
+    """Label the objects at the points; everything else is background.
 
-    Raises InputError for a scene without cameras, for a photo that it does not have, for points outside of the photo,
-    and where no object is found at any of them.
+    Raises InputError for a scene without cameras, unknown photos, points outside their photo, and if no object is found
+    at any point.
     """
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--points: the scene has no cameras; use one that `ngff reconstruct` wrote")
@@ -71,7 +71,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def _surface(scene: Scene, prompt: PointPrompt, undistorted: bool) -> Float[Tensor, "3"]:
-    """The point of the scene that the photo shows there, in the world frame."""
+    """The surface point of the scene at a point of a photo, in the world frame."""
     cameras = scene.cameras
     views = {Path(name).stem: i for i, name in enumerate(cameras.names)} | {n: i for i, n in enumerate(cameras.names)}
     view = views.get(prompt.view) if prompt.view else 0

@@ -1,4 +1,4 @@
-"""Segmentation by a promptable network: masks from boxes, points or automatically, propagated through all photos."""
+"""Segmentation by a promptable network: masks from boxes, points or proposals, propagated through all photos."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ log = logging.getLogger(__name__)
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """Objects marked by the prompts in the first view, or, without prompts, the objects on the table.
+    """Label the objects marked by prompts in the first view or, without prompts, the objects on the table.
 
-    The row of the backend names the function that loads its network from (weights, download, device), which is called
-    once the inputs have been checked. The network is run on the photos, or, without --photos, on the scene rendered
-    from its cameras. Raises InputError for a scene without cameras and for photos without the one that the prompts
-    refer to.
+    The backend's row in BACKENDS names the function (weights, download, device) that loads its network; it is called
+    after the inputs have been checked. The network runs on the photos or, without --photos, on renderings of the scene
+    from its cameras. Raises InputError for a scene without cameras, and if the photo of the prompts is missing.
     """
     name = options.backend
     if scene.cameras is None or not len(scene.cameras):
@@ -55,7 +54,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def point_prompts(prompts: ObjectPrompts, scene: Scene) -> list[PointPrompts]:
-    """Prompts as fractions of the first view: a box for each object, or a point where there are no boxes."""
+    """Convert prompts to fractions of the first view: a box for each object, or a point if there are no boxes."""
     size = scene.cameras.sizes[0].float()
     if prompts.boxes is not None:
         return [PointPrompts.box(box / torch.cat([size, size])) for box in prompts.boxes]

@@ -1,4 +1,4 @@
-"""Prompts of the user: a box or a point for each object, in the first view."""
+"""The user's prompts: a box or a point for each object in the first view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stages.core.scene.schema import MAX_OBJECT_ID, numbers, read_json, reason, 
 
 @dataclass(frozen=True)
 class ObjectPrompts:
-    """One row per object; boxes or points may be None, not both."""
+    """Prompts with one row per object; boxes or points may be None, but not both."""
 
     boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of the undistorted view 0
     points: Float[Tensor, "o 2"] | None  # x y inside the object [px] of the undistorted view 0
@@ -26,11 +26,11 @@ class ObjectPrompts:
 
 
 def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> ObjectPrompts:
-    """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
+    """Read a prompts.json: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
 
-    Either of the first two may be absent or empty. Coordinates are those of the first photo as taken, or with
-    `undistorted` those of its undistorted view; "size": [width, height] is the size of the image that they refer to,
-    where it was resized. Raises InputError for an invalid file.
+    This is the public format; "bbox" or "center_point" may be absent or empty. Coordinates refer to the first photo as
+    taken, or to its undistorted view with `undistorted`. If that image was resized, "size": [width, height] is its
+    size. Raises InputError for an invalid file.
     """
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
@@ -60,7 +60,7 @@ def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> Obj
 
 
 def _table(data: dict, name: str, width: int) -> Float[Tensor, "n w"]:
-    """Rows of pixel coordinates; none where there is no such key."""
+    """Rows of pixel coordinates; empty if the key is absent."""
     found = rows(data.get(name) or [], name)
     if len(found) > MAX_OBJECT_ID:
         raise ValueError(f"{name} has {len(found)} rows; at most {MAX_OBJECT_ID} are read")

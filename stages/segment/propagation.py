@@ -1,4 +1,4 @@
-"""Masks of one view propagated to label images of all views, by a promptable network."""
+"""Propagation of masks in one view to label images of all views, by a promptable network."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stages.segment.view_images import ViewImages
 
 @dataclass(frozen=True)
 class MaskTracker:
-    """A network together with the sequence of images through which it propagates masks."""
+    """A network and the sequence of images through which it propagates masks."""
 
     network: PromptableSegmenter
     scene: Scene
@@ -29,13 +29,13 @@ class MaskTracker:
         return self.network.preprocess(self.images.image(self.images.views[row]))
 
     def proposals(self, row: int) -> Bool[Tensor, "m l l"]:
-        """Masks that the network proposes without prompts for image `row`."""
+        """Masks that the network proposes for image `row` without prompts."""
         return self.network.propose_masks(self.pixels(row))
 
     def labels(self, prompts: Prompts, start: int = 0) -> Iterator[tuple[int, Int[Tensor, "h w"]]]:
-        """Each camera with its label image (1... in the order of the prompts), at the resolution of voting.
+        """Yield the index and label image of each camera, at the resolution of voting.
 
-        `start` is the row of the image that the prompts refer to.
+        Objects have the labels 1... in the order of the prompts. The prompts refer to image `start` of the sequence.
         """
         count = len(self.images)
         found = self.network.propagate(self.pixels, count, prompts, start)
@@ -45,12 +45,12 @@ class MaskTracker:
 
 
 def label_image(logits: Float[Tensor, "o l l"], width: int, height: int) -> Int[Tensor, "h w"]:
-    """Number, counted from 1, of the object with the largest logit in each pixel; 0 where none is positive."""
+    """Number, from 1, of the object with the largest logit at each pixel; 0 where no logit is positive."""
     best, index = resize_logits(logits, width, height).max(0)
     return torch.where(best > 0, index + 1, 0)
 
 
 def resize_logits(logits: Float[Tensor, "o l l"], width: int, height: int) -> Float[Tensor, "o h w"]:
-    """Square logits or masks of the network resized to an image's width and height."""
+    """Resize square logits or masks of the network to the size of an image."""
     size = (height, width)
     return torch.nn.functional.interpolate(logits[None].float(), size, mode="bilinear", align_corners=False)[0]

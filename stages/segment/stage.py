@@ -25,7 +25,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     Raises InputError for invalid inputs; then nothing is written.
     """
     began, segment = time.monotonic(), choose(BACKENDS, "--backend", options.chosen)
-    pick_device(options.device)  # raises for an absent GPU; only networks use one
+    pick_device(options.device)  # raises InputError for an absent GPU, also for backends that do not use one
     whole = read_scene(scene)
     check_output(Path(out), "scene")
     labelled = rename_objects(segment(whole, options), options)
@@ -40,7 +40,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
 
 
 def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
-    """The scene with the names given by the user; raises InputError for an object that does not exist."""
+    """Rename objects as the user asked. Raises InputError for an object that does not exist."""
     have = {o.id for o in scene.objects}
     for number in options.renamed:
         if number not in have:
@@ -66,7 +66,7 @@ def log_objects(scene: Scene) -> None:
 
 
 def _size_text(size, scene: Scene) -> str:
-    """Three lengths in cm, or in scene units where the scale is not known."""
+    """Three lengths in cm, or in scene units if the scale is unknown."""
     if scene.has_known_scale:
         return " x ".join(f"{100 * scene.metres_per_unit * side:.1f}" for side in size) + " cm"
     return " x ".join(f"{side:.3g}" for side in size) + " scene units"

@@ -1,4 +1,4 @@
-"""The images that belong to a scene's cameras: its photos, images made from them, or renderings of the scene."""
+"""Images of a scene's cameras: photos, images derived from photos, or renderings of the scene."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class ViewImages:
 
 
 def view_images(scene: Scene, photos: Path | None = None, undistorted: bool = False) -> ViewImages:
-    """The photos in folder `photos` that the scene's cameras name, undistorted, or a rendering for each camera.
+    """The photos of the cameras in folder `photos`, undistorted; without a folder, a rendering for each camera.
 
-    `undistorted`: the photos already are. One image is in memory at a time. Raises InputError for a folder without
-    such photos, and, on access, for a photo with another aspect ratio than its camera.
+    `undistorted`: the photos are undistorted already. Only one image is in memory at a time. Raises InputError for a
+    folder without such photos and, on access, for a photo whose aspect ratio differs from that of its camera.
     """
     if photos is None:
         return ViewImages(list(range(len(scene.cameras))), lambda view: render_view(scene, view))
@@ -46,7 +46,7 @@ def view_images(scene: Scene, photos: Path | None = None, undistorted: bool = Fa
 
 
 def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
-    """The scene rendered from a camera, on black."""
+    """Render the scene from a camera, on black."""
     width, height = scene.cameras.sizes[view].tolist()
     shrink = min(1.0, MAX_RENDER_SIDE / max(width, height))
     w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
@@ -63,10 +63,10 @@ def _read(scene: Scene, view: int, file: Path, undistorted: bool) -> Float[Tenso
 
 
 def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
-    """The image file of each camera, by the name of its photo without suffix.
+    """The image file of each camera, matched by the name of its photo without suffix.
 
-    `what` (kind of image) and `option` (that named the folder) are used in error messages. Raises InputError where
-    there is no folder or no matching image.
+    `what` (the kind of image) and `option` (which names the folder) are for error messages. Raises InputError if there
+    is no folder or no matching image.
     """
     folder = Path(folder)
     if not folder.is_dir():

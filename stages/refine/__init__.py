@@ -1,1 +1,1 @@
-"""scene.ply to scene.ply with closed objects and a whole background."""
+"""Refinement: scene.ply -> scene.ply with completed objects and background."""

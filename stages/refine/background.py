@@ -1,4 +1,4 @@
-"""Background filling: the table under and behind objects, so that a lifted object leaves no hole."""
+"""Background filling: adds the table under and behind objects, so that a lifted object leaves no hole."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from stages.refine.disc_gaussians import DISC_SIGMA, disc_gaussians
 from stages.refine.inpaint import inpaint
 
 # Lengths in camera distances (see `ViewExtent`) were tuned on photos of tabletops taken from all around.
-MAX_VIEW_CELLS = 1024  # cells along the longer side of the top view
+MAX_VIEW_CELLS = 1024  # most cells along the longer side of the top view
 FOOTPRINT_CELLS = 40_000  # approximate number of cells under objects
 VIEW_MARGIN = 0.2  # width of the table around all objects that the top view includes [camera distance]
-FILL_MARGIN = 0.06  # width around an object's footprint that is filled where hidden [camera distance]
-SHADOW_WIDTH = 0.04  # width around a hole in which contact shadows are removed [camera distance]
-COMPARISON_SIGMA = 0.25  # standard deviation of the blur at which colours are compared there [SHADOW_WIDTH]
-MIN_RESIDUAL_RATIO = 3.0  # of a stained cell's colour difference to the usual inpainting error (RMS)
-SKIRT_WIDTH = 0.02  # around an object in which the table may have its colours [camera distance]
-MAX_STAINED_FRACTION = 0.25  # of the cells next to a hole; above it all of them are replaced
+FILL_MARGIN = 0.06  # width of the border around an object's footprint that is filled where hidden [camera distance]
+SHADOW_WIDTH = 0.04  # width of the border around a hole in which contact shadows are removed [camera distance]
+COMPARISON_SIGMA = 0.25  # standard deviation of the blur before colours in this border are compared [SHADOW_WIDTH]
+MIN_RESIDUAL_RATIO = 3.0  # smallest ratio of a stained cell's colour difference to the usual inpainting error (RMS)
+SKIRT_WIDTH = 0.02  # width of the border around an object in which the table may have its colours [camera distance]
+MAX_STAINED_FRACTION = 0.25  # stained fraction of the cells next to a hole, above which all of them are replaced
 SHARPENING = 0.7  # fraction of the blur between neighbouring discs that is compensated
-MIN_VISIBLE_FRACTION = 0.25  # of the cameras, for a cell of table to count as seen
-GRAZING_DEPTH = 0.03  # depth range of a pixel of table at a flat angle [camera distance]
-MAX_GAP = 0.03  # width of free-space gaps that are reconstruction errors and are filled [camera distance]
-MIN_COLOUR_DIFFERENCE = 6.0  # of a stained cell from the table [CIELAB]
-MIN_COVERED_ALPHA = 0.92  # above which table is present
-MIN_COLOUR_ALPHA = 0.6  # above which the table's colour is known
+MIN_VISIBLE_FRACTION = 0.25  # fraction of the cameras above which a cell of table counts as seen
+GRAZING_DEPTH = 0.03  # depth range of a pixel of table at a grazing angle [camera distance]
+MAX_GAP = 0.03  # largest width of free-space gaps that are reconstruction errors and are filled [camera distance]
+MIN_COLOUR_DIFFERENCE = 6.0  # smallest colour difference of a stained cell from the table [CIELAB]
+MIN_COVERED_ALPHA = 0.92  # alpha above which table is present
+MIN_COLOUR_ALPHA = 0.6  # alpha above which the table's colour is known
 DENT_CELL = 0.015  # side of the cells in which depths below the surface are measured [camera distance]
-MAX_DENT = 0.1  # depth of a dent; objects extending deeper hang over the edge [camera distance]
-STRAY_POINTS = 3  # deepest Gaussians of a dent cell that are ignored
-MIN_TABLE_GAUSSIANS = 50  # or the background is left unchanged
+MAX_DENT = 0.1  # largest depth of a dent; objects that extend deeper hang over the edge [camera distance]
+STRAY_POINTS = 3  # number of the deepest Gaussians of a dent cell that are ignored
+MIN_TABLE_GAUSSIANS = 50  # fewest Gaussians of a table that is filled
 
 
 @dataclass(frozen=True)
 class TopView:
     """Orthographic image of the table from above; one pixel per cell, rows along -y."""
 
-    corner: Float[Tensor, "2"]  # x of the first column's edge, y of the first row's
-    cell: float  # [scene units]
+    corner: Float[Tensor, "2"]  # x of the edge of the first column, y of the edge of the first row
+    cell: float  # side of a cell [scene units]
     top: float  # height of the surface in the middle [scene units]
     rgb: Float[np.ndarray, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
@@ -71,19 +71,19 @@ class TopView:
         return torch.stack([self.corner[0] + (column + 0.5) * self.cell, self.corner[1] - (row + 0.5) * self.cell], 1)
 
     def on(self, support: Support, mask: np.ndarray) -> Float[Tensor, "m 3"]:
-        """Centres of the cells in a mask on the surface, or below it in dents."""
+        """Centres of the cells in a mask, at the height of the surface or of a dent."""
         points = self.centres(mask)
         height = support.surface(points) - torch.from_numpy(self.dent[mask])
         return torch.cat([points, height[:, None]], 1)
 
 
 def fill_background(scene: Scene, observed: ObservedSpace, support: Support, seed: int = 0) -> Scene:
-    """The scene with discs on the supporting surface where objects hide it: under them, with a margin.
+    """Add discs on the supporting surface where objects hide it: under objects, with a margin.
 
     The table without objects is rendered from above, and its holes under and next to objects are inpainted. Cells of
-    table that few cameras see, or that are close to an object, may be its shadow or unlabelled parts of it: they are
-    replaced where they differ from the inpainted colours. Observed free space, and cells beyond the edge of the
-    table, are not filled.
+    table that few cameras see, or that are close to an object, may be shadows or unlabelled parts of the object: they
+    are replaced if they differ from the inpainted colours. Observed free space, and cells beyond the edge of the table,
+    are not filled.
     """
     g, R = scene.gaussians, support.view.radius
     flat = (support.heights(g.means).abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * R)
@@ -110,8 +110,10 @@ def fill_background(scene: Scene, observed: ObservedSpace, support: Support, see
 def _missing(
     view: TopView, objects: Float[Tensor, "m 3"], support: Support, observed: ObservedSpace, seed: int
 ) -> tuple[Bool[np.ndarray, "h w"], ...]:
-    """Masks of the cells to fill, of those under or close to objects, of those that texture is copied from, and of
-    those so far from objects that the table has none of their colours.
+    """Masks of the cells: hole, near, known and pure.
+
+    hole: to be filled; near: under or close to objects; known: texture is copied from them; pure: so far from objects
+    that the table has none of their colours.
     """
     R = support.view.radius
     under = _footprint(objects, support, view)
@@ -128,7 +130,7 @@ def _missing(
     width = 2 * support.tolerance + view.cell
     empty = _where(hole | seen, view, support, lambda points: observed.is_free(points, width))
     known, pure = seen & ~hole & ~empty, ndimage.distance_transform_edt(~under) > SKIRT_WIDTH * R / view.cell
-    known &= ~hidden if bool((known & ~hidden).any()) else ~hidden_under  # without cameras all cells are hidden
+    known &= ~hidden if bool((known & ~hidden).any()) else ~hidden_under  # without cameras, all cells are hidden
     hole &= ~ndimage.binary_opening(empty & hole, iterations=max(1, round(MAX_GAP * R / view.cell / 2)))
     if known.any():
         hole |= _stained(view, _Cells(hole, seen & near, known, hidden_under, pure), SHADOW_WIDTH * R / view.cell, seed)
@@ -136,13 +138,13 @@ def _missing(
 
 
 class _Cells(NamedTuple):
-    """Masks of the top view."""
+    """Masks of cells of the top view."""
 
-    hole: Bool[np.ndarray, "h w"]  # to be filled
-    seen_near: Bool[np.ndarray, "h w"]  # of known colour, under or close to objects
-    known: Bool[np.ndarray, "h w"]  # that texture is copied from
-    hidden_under: Bool[np.ndarray, "h w"]  # under objects, seen by few cameras
-    pure: Bool[np.ndarray, "h w"]  # away from objects
+    hole: Bool[np.ndarray, "h w"]  # cells to be filled
+    seen_near: Bool[np.ndarray, "h w"]  # cells of known colour under or close to objects
+    known: Bool[np.ndarray, "h w"]  # cells from which texture is copied
+    hidden_under: Bool[np.ndarray, "h w"]  # cells under objects that few cameras see
+    pure: Bool[np.ndarray, "h w"]  # cells away from objects
 
 
 def _discs(view: TopView, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:
@@ -156,16 +158,17 @@ def _discs(view: TopView, support: Support, cells: np.ndarray, colour: np.ndarra
 def _where(
     cells: Bool[np.ndarray, "h w"], view: TopView, support: Support, test: Callable[[Tensor], Tensor]
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask of those cells whose point on the surface passes a test."""
+    """Mask of the cells in `cells` whose points on the surface pass a test."""
     out = np.zeros(cells.shape, bool)
     out[cells] = test(view.on(support, cells)).numpy()
     return out
 
 
 def _stained(view: TopView, cells: _Cells, width: float, seed: int) -> Bool[np.ndarray, "h w"]:
-    """Stained cells: hidden ones, and those next to a hole, whose colour differs from the inpainted table.
+    """Mask of stained cells: those hidden under objects or next to a hole, with a colour unlike the inpainted table.
 
-    The tolerance is the inpainting error measured on known cells around them, which is large on textured tables.
+    The tolerance depends on the inpainting error of known cells around them, which is large on textured tables. `width`
+    is that of the border next to a hole [cells].
     """
     hole, known, hidden_under = cells.hole, cells.known, cells.hidden_under
     suspect = cells.seen_near & ~hole & (hidden_under | _adjacent(hole | hidden_under, width))
@@ -183,14 +186,14 @@ def _stained(view: TopView, cells: _Cells, width: float, seed: int) -> Bool[np.n
 
 
 def _blurred(values: np.ndarray, where: Bool[np.ndarray, "h w"], sigma: float) -> np.ndarray:
-    """Gaussian blur of the values inside a mask, normalised by the blurred mask."""
+    """Gaussian blur of the values in a mask, normalised by the blurred mask; `sigma` in cells."""
     weight = where.astype(np.float32)
     mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma).reshape(values.shape)
     return mean / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-6)[..., None]
 
 
 def _adjacent(hole: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
-    """Cells within `distance` of a hole; for holes narrower than that, which may be texture, only adjacent cells."""
+    """Cells within `distance` of a hole; next to narrower holes, which may be texture, only cells within 2 cells."""
     far = ndimage.distance_transform_edt(hole) < distance / 2
     if far.all():
         return ndimage.binary_dilation(hole, iterations=2)
@@ -198,7 +201,7 @@ def _adjacent(hole: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray
 
 
 def _diffuse(table: Gaussians, observed: ObservedSpace) -> Gaussians:
-    """The table with view-independent colours, the mean over the cameras, since none looks straight down."""
+    """The table with view-independent colours: the mean over the cameras, since no camera looks straight down."""
     if not observed.views:
         return table
     eyes = centres(torch.stack([viewmat for viewmat, *_ in observed.views]))
@@ -207,7 +210,7 @@ def _diffuse(table: Gaussians, observed: ObservedSpace) -> Gaussians:
 
 
 def _top_view(table: Gaussians, objects: Float[Tensor, "m 3"], support: Support) -> TopView | None:
-    """The top view of the table around all objects; None where they have no extent."""
+    """The top view of the table around all objects; None if they have no extent."""
     margin = VIEW_MARGIN * support.view.radius
     low, high = objects[:, :2].amin(0) - margin, objects[:, :2].amax(0) + margin
     longest = float((high - low).max())
@@ -233,7 +236,7 @@ def _dent(objects: Float[Tensor, "m 3"], support: Support, view: TopView) -> Flo
     below = (depth > 0) & (depth < MAX_DENT * support.view.radius)
     row, column = (index[below] // times for index in view.rows_columns(objects))
     square = row * depths.shape[1] + column
-    order = np.lexsort((-depth[below], square))  # the deepest of each cell first
+    order = np.lexsort((-depth[below], square))  # by cell, then deepest first
     squares, first, count = np.unique(square[order], return_index=True, return_counts=True)
     valid = count > STRAY_POINTS
     depths.flat[squares[valid]] = depth[below][order][first[valid] + STRAY_POINTS] + view.cell
@@ -245,7 +248,7 @@ def _dent(objects: Float[Tensor, "m 3"], support: Support, view: TopView) -> Flo
 def _render_from_above(
     table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float, shape: tuple[int, int]
 ) -> TopView:
-    """The top view with this corner, cell and shape (rows, columns), from so high that it is nearly orthographic."""
+    """Render the top view with this corner, cell and shape (rows, columns), nearly orthographic from a large height."""
     height, width = shape
     height_above = 50 * max(shape) * cell
     viewmat = torch.diag(torch.tensor([1.0, -1, -1, 1]))
@@ -260,7 +263,7 @@ def _render_from_above(
 
 
 def _footprint(objects: Float[Tensor, "m 3"], support: Support, view: TopView) -> np.ndarray:
-    """Cells directly under objects that stand on the table or are close above it."""
+    """Mask of the cells directly under objects that stand on the table or are close above it; gaps are closed."""
     low = support.heights(objects) < 0.3 * support.view.radius
     under = np.zeros(view.alpha.shape, bool)
     under[view.rows_columns(objects[low])] = True

@@ -1,7 +1,7 @@
 """Completion by a generator: DiffSplat generates the whole object from the photo that shows it best.
 
-The photo's camera gives the approximate pose, registration the accurate one. Gaussians seen in the photos are kept;
-the generated object provides the unseen ones, its colours adapted to the seen part.
+The photo's camera gives an approximate pose, which registration refines. Gaussians seen in the photos are kept; the
+generated object provides the unseen ones, with colours adapted to the seen part.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from stages.refine.registration import MIN_REGISTRATION_POINTS, register
 from stages.refine.upscale import RESTORED_SIDE, upscaled
 
 log = logging.getLogger(__name__)
-MIN_FIT = 0.5  # below it, another object; true output maps reach 0.95, those of random weights 0.01
+MIN_FIT = 0.5  # fit below which it is another object; true output maps reach 0.95, those of random weights 0.01
 
 
 def complete(
     scene: Scene, number: int, observed: ObservedSpace, support: Support | None, options: RefineOptions
 ) -> Gaussians:
-    """The completer "diffsplat": Gaussians of the generated object where it was not seen, if it fits."""
+    """The completer "diffsplat": Gaussians of the generated object on the unseen sides, if it fits."""
     device = pick_device(options.device)
     upscaler = choose(UPSCALERS, "--upscale", options.upscale)(options)
     model = _model(options.weights, options.download, device)
@@ -74,5 +74,5 @@ def _model(weights: Path | None, download: bool, device: str):
 
 
 def weights_file() -> Path:
-    """Path of DiffSplat's decoder weights, as an example of its files; raises InputError where some are missing."""
+    """Path of DiffSplat's decoder weights, as one of its files. Raises InputError if any file is missing."""
     return find().gsvae

@@ -10,7 +10,7 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.rotations import quaternion
 from stages.core.scene.gaussians import Gaussians
 
-DISC_SIGMA, DISC_THICKNESS = 0.65, 0.12  # standard deviations [spacing]: no holes, little overlap
+DISC_SIGMA, DISC_THICKNESS = 0.65, 0.12  # standard deviations in and across the disc [spacing]: no holes, small overlap
 
 
 def disc_gaussians(
@@ -21,7 +21,7 @@ def disc_gaussians(
     object_id: int,
     opacity: float = 0.97,
 ) -> Gaussians:
-    """Opaque discs perpendicular to the normals, one per point, for points about `spacing` [scene units] apart."""
+    """Opaque discs orthogonal to the normals, one per point, for points about `spacing` [scene units] apart."""
     count = len(points)
     normals = torch.nn.functional.normalize(normals, dim=1)
     helper = torch.eye(3)[normals.abs().argmin(1)] if count else torch.zeros(0, 3)

@@ -1,4 +1,4 @@
-"""Completion in the convex hull: unseen space in an object's hull is filled, and its surface covered with discs."""
+"""Completion in the convex hull: fills the unseen part of an object's hull and covers its surface with discs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import disc_gaussians, empty_like
 from stages.refine.options import RefineOptions
 
-MIN_GAUSSIANS = 16  # of an object that is completed
-PADDING = 3  # empty cells around the object
-MAX_HULL_POINTS = 20_000  # of a convex hull
+MIN_GAUSSIANS = 16  # fewest Gaussians of an object that is completed
+PADDING = 3  # empty cells on each side of the object
+MAX_HULL_POINTS = 20_000  # about the most points of which a convex hull is computed
 
 
 def no_completion(
@@ -36,10 +36,10 @@ def no_completion(
 def complete(
     scene: Scene, number: int, observed: ObservedSpace, support: Support | None, options: RefineOptions
 ) -> Gaussians:
-    """The completer "close": discs on the unseen sides of an object, in the colours of the seen surface next to them.
+    """The completer "close": discs on the unseen sides of an object, with colours of the adjacent seen surface.
 
-    The object's volume is its convex hull, extended down to the plane it stands on, without observed free space and
-    other objects. Time and memory are bounded by the number of cells, at most (resolution + 6)^3.
+    The object's volume is its convex hull, extended down to the plane on which it stands, without observed free space
+    and other objects. Time and memory are bounded by the number of cells, at most (resolution + 6)^3.
     """
     g = scene.gaussians
     own = g[(g.object_id == number) & (g.opacities > 0.05) & g.means.isfinite().all(1) & g.scales.isfinite().all(1)]
@@ -57,15 +57,15 @@ def complete(
 
 @dataclass(frozen=True)
 class ObjectVoxels:
-    """Voxel grid around an object."""
+    """A voxel grid around an object."""
 
-    low: Float[Tensor, "3"]  # corner of the first cell [scene units]
-    cell: float  # [scene units]
+    low: Float[Tensor, "3"]  # lower corner of the first cell [scene units]
+    cell: float  # side of a cell [scene units]
     shape: tuple[int, int, int]
 
     @staticmethod
     def around(own: Gaussians, support: Support | None, resolution: int) -> ObjectVoxels | None:
-        """The grid with at most `resolution` cells along the longest side; None where the object has no extent."""
+        """A grid with at most `resolution` cells along the object's longest side; None if the object has no extent."""
         low, high = own.means.amin(0), own.means.amax(0)
         if support is not None:
             low = torch.cat([low[:2], torch.minimum(low[2], support.surface(own.means).amin())[None]])
@@ -78,7 +78,7 @@ class ObjectVoxels:
         return ObjectVoxels(low - PADDING * cell, cell, tuple(shape.tolist()))
 
     def occupancy(self, points: Float[Tensor, "n 3"]) -> np.ndarray:
-        """Whether each cell contains a point."""
+        """Mask of the cells that contain a point."""
         index = ((points - self.low) / self.cell).floor().long()
         index = index[((index >= 0) & (index < torch.tensor(self.shape))).all(1)]
         out = np.zeros(self.shape, bool)
@@ -92,7 +92,7 @@ class ObjectVoxels:
 
 
 def _sigma_points(g: Gaussians, max_sigma: float) -> Float[Tensor, "m 3"]:
-    """The means and the points one standard deviation, at most `max_sigma`, along each axis."""
+    """The means, and points one standard deviation (at most `max_sigma`) away in both directions of each axis."""
     axes = matrix(g.quats) * g.scales.clamp(max=max_sigma)[:, None, :]
     return torch.cat([g.means, *(g.means + sign * axes[:, :, a] for a in range(3) for sign in (-1, 1))])
 
@@ -105,7 +105,7 @@ def _volume(
     observed: ObservedSpace,
     support: Support | None,
 ) -> np.ndarray:
-    """Cells of the object's volume, seen or not."""
+    """Mask of the cells of the object's volume, seen and unseen."""
     occupied = grid.occupancy(_sigma_points(own, 2 * grid.cell))
     centres = grid.centres()
     inside = torch.from_numpy(_in_hull(_grounded_points(own, support), centres, 0.5 * grid.cell))
@@ -123,7 +123,7 @@ def _volume(
         seen_through = torch.zeros(len(centres), dtype=torch.bool)
         seen_through[cells] = observed.is_free(centres[cells], 1.5 * grid.cell)
         volume = volume & ~seen_through.numpy().reshape(grid.shape)
-    else:  # free space is unknown: fills only the volume that the object encloses
+    else:  # free space is unknown: fill only the volume that the object encloses
         volume = ndimage.binary_fill_holes(
             ndimage.binary_closing(occupied | _cells_below(occupied, volume), iterations=2)
         )
@@ -133,7 +133,7 @@ def _volume(
 
 
 def _nearer_to(own: Gaussians, others: Gaussians, points: Tensor, asked: Tensor) -> Tensor:
-    """Of the points in the mask `asked`, those nearer to the object than to any other object."""
+    """Mask of the points in the mask `asked` that are nearer to the object than to any other object."""
     low, high = points.amin(0), points.amax(0)
     others = others[((others.means > low) & (others.means < high)).all(1)]
     out = asked.clone()
@@ -143,9 +143,9 @@ def _nearer_to(own: Gaussians, others: Gaussians, points: Tensor, asked: Tensor)
 
 
 def _grounded_points(own: Gaussians, support: Support | None) -> np.ndarray:
-    """The object's points and the projections of its lowest part onto the plane that it stands on.
+    """The object's points, and the projection of its lowest part onto the plane on which it stands.
 
-    If the seen part would topple, the unseen part must support it: then all points are projected.
+    If the seen part alone would topple, the unseen part must support it; then all points are projected.
     """
     points = own.means
     if support is not None:
@@ -158,7 +158,7 @@ def _grounded_points(own: Gaussians, support: Support | None) -> np.ndarray:
 
 
 def _in_hull(points: np.ndarray, queries: Float[Tensor, "c 3"], margin: float) -> np.ndarray:
-    """Whether queries are in the convex hull of points or within `margin` of it; False without volume."""
+    """Mask of the queries inside the convex hull of points or within `margin` of it; all False for a flat hull."""
     try:
         hull = ConvexHull(points[:: max(1, len(points) // MAX_HULL_POINTS)]).equations.astype(np.float32)
     except (QhullError, ValueError):
@@ -168,7 +168,7 @@ def _in_hull(points: np.ndarray, queries: Float[Tensor, "c 3"], margin: float) -
 
 
 def _cells_below(occupied: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Cells below the lowest quarter of an object, down to the plane."""
+    """Mask of the cells below occupied cells in the lowest quarter of an object, down to the plane."""
     z = np.flatnonzero(occupied.any((0, 1)))
     top = z[0] + max(1, (z[-1] - z[0]) // 4) if len(z) else 0
     under = np.flip(np.logical_or.accumulate(np.flip(occupied, 2), 2), 2)  # below an occupied cell
@@ -177,7 +177,7 @@ def _cells_below(occupied: np.ndarray, inside: np.ndarray) -> np.ndarray:
 
 
 def _open_surface(grid: ObjectVoxels, volume: np.ndarray, own: Gaussians) -> tuple[Tensor, Tensor]:
-    """Points and outward normals on the volume's surface where the object has no Gaussians yet."""
+    """Points and outward normals on the surface of the volume where the object has no Gaussians."""
     soft = ndimage.gaussian_filter(volume.astype(np.float32), 1.0)
     skin = volume & ~ndimage.binary_erosion(volume)
     index = torch.from_numpy(np.argwhere(skin))
@@ -199,7 +199,7 @@ def _diffused_colours(points: Float[Tensor, "m 3"], own: Gaussians, cell: float)
     rgb = (own.sh[:, 0] * C0 + 0.5).clamp(0, 1)[index]
     rgb = (rgb * weight[..., None]).sum(1) / weight.sum(1, keepdim=True).clamp_min(1e-12)
     _, near = knn(points, points, 9)
-    edge = distance[:, :1] < 2 * cell  # next to the seen surface: fixed, so that there is no seam
+    edge = distance[:, :1] < 2 * cell  # adjacent to the seen surface: kept fixed, so that there is no seam
     for _ in range(20):
         rgb = torch.where(edge, rgb, rgb[near].mean(1))
     return rgb

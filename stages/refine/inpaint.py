@@ -1,13 +1,13 @@
-"""Exemplar-based inpainting: holes of an image are filled with patches from its known part.
+"""Exemplar-based inpainting: fills holes of an image with patches from its known part.
 
 Patches are chosen, coarse to fine, to agree with the surroundings of the hole and with each other, which continues
 edges and texture. Finally, the difference in brightness between the boundary of the hole and the copied patches is
 interpolated smoothly over the hole, so that there is no seam.
 
-Patches are compared in integers: colours of 8 bits, weights of 10 bits. Sums of their products are exact in float64
-in any order, so the result does not depend on the number of threads or on the processor.
+Patches are compared in integers: colours with 8 bits, weights with 10 bits. Sums of their products are exact in float64
+in any order, so that the result does not depend on the number of threads or on the processor.
 
-Source: Wexler, Shechtman and Irani 2007, "Space-time completion of video"; the search is that of Barnes et al. 2009,
+Source: Wexler, Shechtman and Irani 2007, "Space-time completion of video"; search as in Barnes et al. 2009,
 "PatchMatch".
 """
 
@@ -21,20 +21,20 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 PATCH_RADIUS = 3  # [px]
-ILLUMINATION_SIGMA = 6.0  # of the blur of brightness differences [px]
+ILLUMINATION_SIGMA = 6.0  # standard deviation of the blur of brightness differences [px]
 MAX_ILLUMINATION = 0.1  # largest brightness difference that is interpolated; larger ones are other surfaces
-MAX_DEPTH = 4  # of a hole that is filled without a coarser level [px]
-MIN_SOURCES = 1000  # source patches of a coarser level, so that all kinds of edges are among them
-MAX_COARSEST_TARGETS = 40_000  # target patches of the coarsest level, for any number of sources
-MAX_SOURCE_PATCHES = 8000  # compared with every target of the coarsest level
-MAX_SEARCHED_TARGETS = 60_000  # targets of a finer level that are searched; with more, coarse matches are kept
-MIN_SOURCE_RATIO = 0.3  # source patches per target patch; below it, colours are interpolated
-MAX_TRIAL_TARGETS = 12_000  # target patches of all trials together
-TRIES = 8  # trials at the coarsest level, of which that with the smallest patch distance is used
-KNOWN_FRACTION = (0.25, 0.65)  # range of the known fraction of a patch that is matched next, drawn for each trial
-WAITING_FRACTION = (0.5, 0.95)  # range of the fraction of patches, of low contrast, that are matched later
-ROUNDS = 3  # of search at each finer level
-DEPTH_DECAY = 0.7  # weight of a pixel of the hole, per pixel of depth
+MAX_DEPTH = 4  # largest depth of a hole that is filled without a coarser level [px]
+MIN_SOURCES = 1000  # fewest source patches of a coarser level, so that they contain all kinds of edges
+MAX_COARSEST_TARGETS = 40_000  # most target patches of the coarsest level, for any number of sources
+MAX_SOURCE_PATCHES = 8000  # most source patches that are compared with every target of the coarsest level
+MAX_SEARCHED_TARGETS = 60_000  # most targets of a finer level that are searched; with more, coarse matches are kept
+MIN_SOURCE_RATIO = 0.3  # source patches per target patch, below which colours are interpolated
+MAX_TRIAL_TARGETS = 12_000  # most target patches of all trials together
+TRIES = 8  # most trials at the coarsest level, of which the one with the smallest patch distance is used
+KNOWN_FRACTION = (0.25, 0.65)  # range of the smallest known fraction of patches matched next; drawn for each trial
+WAITING_FRACTION = (0.5, 0.95)  # range of the fraction of patches that wait, with low contrast; drawn for each trial
+ROUNDS = 3  # rounds of search at each finer level
+DEPTH_DECAY = 0.7  # factor on the weight of a pixel of the hole per pixel of depth
 COLOUR = 255  # integer colour of full intensity
 WEIGHT = 1023  # integer weight of a known pixel
 VOTE = 1 << 14  # integer weight of an exactly matching patch
@@ -49,10 +49,10 @@ def inpaint(
     rounds: int = ROUNDS,
     pure: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The image with the holes filled; pixels that are neither hole nor known are unchanged and not copied from.
+    """Fill the holes of an image. Pixels that are neither hole nor known are unchanged, and not used as source.
 
-    Fewer `rounds` of search at full size, or none, are faster and give a more blurred result. Where the known pixels
-    are too few to copy texture from, colours are interpolated between those of them that are `pure`.
+    Fewer `rounds` of search at full size, or none, are faster and give a more blurred result. If there are too few
+    known pixels for copying texture, colours are interpolated between the known pixels that are `pure`.
     """
     known = known & ~hole
     if not known.any() or not hole.any():
@@ -65,12 +65,12 @@ def inpaint(
 
 
 def _interpolated(rgb: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """The image with all but the known pixels interpolated."""
+    """Interpolate all pixels that are not known."""
     return _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
 
 
 def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Values where the weight is 1; elsewhere interpolated from coarser levels.
+    """Keep values where the weight is 1, and interpolate elsewhere from coarser levels.
 
     Source: Gortler et al. 1996, "The lumigraph", push and pull.
     """
@@ -88,13 +88,13 @@ def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 @dataclass
 class _Level:
-    """Pyramid level. Targets are the pixels whose patches overlap the hole; sources those with fully known patches."""
+    """A pyramid level. Targets are pixels whose patches overlap the hole; sources, pixels with fully known patches."""
 
     image: np.ndarray  # (h, w, 3) integer colours, modified in place
-    hole: np.ndarray  # (h, w)
-    trust: np.ndarray  # (h, w) integer weight of a pixel in patch comparisons
-    source: np.ndarray  # (h, w) whether the patch around a pixel is fully known
-    at: np.ndarray  # (t, 2) targets: row, column
+    hole: np.ndarray  # (h, w) mask of the pixels to fill
+    trust: np.ndarray  # (h, w) integer weight of each pixel in patch comparisons
+    source: np.ndarray  # (h, w) mask of the sources
+    at: np.ndarray  # (t, 2) row and column of the targets
 
     @staticmethod
     def of(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> _Level:
@@ -107,11 +107,11 @@ class _Level:
         return _Level(image.copy(), hole, trust, ndimage.binary_erosion(known, side) & inner, np.argwhere(near))
 
     def patches(self, at: Int[np.ndarray, "t 2"]) -> Float[np.ndarray, "t p 3"]:
-        """Colours of the patches around pixels."""
+        """Colours of the patches around the pixels `at`."""
         return self.image.reshape(-1, 3).take(self._cells(at), axis=0)
 
     def weights(self, at: Int[np.ndarray, "t 2"], known: Bool[np.ndarray, "h w"] | bool = True) -> np.ndarray:
-        """Weights of the patches' pixels, 0 where not `known` (t, p)."""
+        """Weights (t, p) of the pixels of the patches around the pixels `at`, 0 where not `known`."""
         return (self.trust * known).ravel().take(self._cells(at))
 
     def _cells(self, at: Int[np.ndarray, "t 2"]) -> Int[np.ndarray, "t p"]:
@@ -121,33 +121,33 @@ class _Level:
     def distances(
         self, P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], match: Int[np.ndarray, "t 2"]
     ) -> Float[np.ndarray, "t"]:
-        """Weighted mean squared distance of patches to those around their matches."""
+        """Weighted mean squared difference between patches P and the patches around their matches."""
         difference = P - self.patches(match)
         return np.einsum("tp,tpc,tpc->t", W, difference, difference) / W.sum(1).clip(1)
 
     def vote(
         self, at: Int[np.ndarray, "t 2"], match: Int[np.ndarray, "t 2"], distance: Float[np.ndarray, "t"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Set pixels of the hole to the weighted mean of the patches covering them; returns their mask."""
+        """Set pixels of the hole to the weighted mean of the matched patches that cover them; returns their mask."""
         mean, filled = self.blended(at, match, distance)
         filled &= self.hole
         self.image[filled] = np.rint(mean[filled])
         return filled
 
     def blended(self, at: np.ndarray, match: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of the matched patches covering each pixel, weighted by quality, and the mask of covered pixels."""
+        """Mean of the matched patches that cover each pixel, weighted by quality, and the mask of covered pixels."""
         sigma = max(float(np.median(distance)), 1e-3)
         weight = np.rint(VOTE * (np.exp(-distance / (0.5 * sigma)) + 1e-4))[:, None]
         total = np.zeros((self.hole.size, 4))
         image = np.concatenate([self.image, np.ones((*self.hole.shape, 1))], 2).reshape(-1, 4)
         to, of = self._cells(at), self._cells(match)
         for p in range(to.shape[1]):
-            total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # targets are unique, so pixels are too
+            total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # no duplicate indices, as targets are unique
         total = total.reshape(*self.hole.shape, 4)
         return total[..., :3] / total[..., 3:].clip(1), total[..., 3] > 0
 
     def equalise(self, match: Int[np.ndarray, "t 2"]) -> None:
-        """Add the brightness difference of image and matched patches at the boundary, interpolated over the hole."""
+        """Add the difference between image and matched patches at the boundary to the hole, interpolated over it."""
         distance = self.distances(self.patches(self.at), self.weights(self.at), match)
         mean, filled = self.blended(self.at, match, distance)
         boundary = (filled & ~self.hole & (self.trust > 0)).astype(np.float32)
@@ -161,7 +161,7 @@ class _Level:
 def _fill(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int
 ) -> np.ndarray | None:
-    """The image with its hole filled, from the coarsest level to the finest; None where too few patches are known."""
+    """Fill the hole from the coarsest level to the finest; None if too few patches are known."""
     levels = [_Level.of(image, hole, known)]
     while ndimage.distance_transform_edt(hole).max() > MAX_DEPTH:
         image, hole, known = _downsample(image, hole, known)
@@ -181,17 +181,17 @@ def _fill(
 
 
 def _downsample(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image and masks at half the size; a pixel is known if mostly_known of it is, else hole if any of it is."""
+    """Image and masks at half the size; a pixel is known if 3 of its 4 pixels are, else a hole if any of them is."""
     height, width = (side // 2 * 2 for side in hole.shape)
     four = lambda v: v[:height, :width].reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
-    weight = 999 * known + 1  # unknown pixels count only where no known one does
+    weight = 999 * known + 1  # unknown pixels matter only where there is no known one
     half = np.rint(four(image * weight[..., None]) / four(weight)[..., None])
     mostly_known = four(known) >= 3
     return half, (four(hole) > 0) & ~mostly_known, mostly_known
 
 
 def _best_trial(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
-    """The field of matches of the trial with the smallest patch distance; broken edges increase that distance."""
+    """Match field of the trial with the smallest patch distance, which broken edges increase."""
     fields, costs, images, start = [], [], [], level.image.copy()
     for _ in range(max(1, min(TRIES, MAX_TRIAL_TARGETS // len(level.at)))):
         level.image[:] = start
@@ -207,7 +207,7 @@ def _best_trial(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w
 def _search(
     level: _Level, rng: np.random.Generator, min_known: float, waiting: float, rounds: int = 4
 ) -> Int[np.ndarray, "h w 2"]:
-    """Exhaustive search of a match for every target: from the boundary inwards, then for all targets together.
+    """Exhaustive search for the best match of every target: from the boundary inwards, then for all targets together.
 
     Patches of high contrast are matched first, so that edges continue straight before uniform regions cover them.
     """
@@ -235,7 +235,7 @@ def _search(
 
 
 def _high_contrast(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], waiting: float) -> Bool[np.ndarray, "t"]:
-    """Mask of the patches with the highest contrast in their known pixels."""
+    """Mask of the patches whose contrast in known pixels is above the quantile `waiting`."""
     total = W.sum(1)
     squares, sums = np.einsum("tp,tpc,tpc->t", W, P, P), np.einsum("tp,tpc->tc", W, P)
     contrast = (squares - np.einsum("tc,tc->t", sums, sums) / total) / total
@@ -243,7 +243,7 @@ def _high_contrast(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], w
 
 
 def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:
-    """Index of the row of Q nearest to each patch, by squared distance weighted by W."""
+    """Index of the row of Q that is nearest to each patch, by squared distance weighted by W."""
     squares = (Q * Q).reshape(len(Q), -1, 3).sum(2)
     sources, nearest = np.concatenate([squares, -2 * Q], 1).T, []
     for i in range(0, len(P), 512):
@@ -254,7 +254,7 @@ def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Floa
 
 
 def _refine(level: _Level, coarse: Int[np.ndarray, "h w 2"], rng: np.random.Generator, rounds: int) -> np.ndarray:
-    """Matches of the coarser level upsampled, then improved by propagation from neighbours and random search."""
+    """Upsample the matches of the coarser level, and improve them by propagation from neighbours and random search."""
     cell = np.minimum(level.at // 2, np.array(coarse.shape[:2]) - 1)
     match = 2 * coarse[cell[:, 0], cell[:, 1]] + level.at - 2 * cell
     nearest = ndimage.distance_transform_edt(~level.source, return_distances=False, return_indices=True)

@@ -1,6 +1,6 @@
-"""Completion from a library of whole objects: the asset that fits the seen part best is registered to it.
+"""Completion from a library of whole objects: registers the asset that fits the seen part best.
 
-Gaussians seen in the photos are kept; the asset provides the unseen ones, its colours adapted to the seen part.
+Gaussians seen in the photos are kept; the asset provides the unseen ones, with colours adapted to the seen part.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from stages.refine.registration_cloud import RegistrationCloud
 from stages.refine.registration_matches import SIDE, matched_place, view_of
 
 log = logging.getLogger(__name__)
-MIN_FIT = 0.8  # below it, the asset is another object
-MAX_FREE_FRACTION = 0.1  # of an asset's Gaussians in observed free space; above it, the asset is another object
-FINE_CANDIDATES = 2  # assets that are registered accurately, those with the best coarse fit
-SEEN_DISTANCE = 0.02  # distance from the part within which the asset is not used [diameters]
-MIN_ASSET_GAUSSIANS = 100  # opaque ones, or the asset is refused
+MIN_FIT = 0.8  # fit below which the asset is another object
+MAX_FREE_FRACTION = 0.1  # fraction of an asset in observed free space above which it is another object
+FINE_CANDIDATES = 2  # number of assets with the best coarse fit that are registered accurately
+SEEN_DISTANCE = 0.02  # distance from the seen part within which the asset is not used [diagonal of the asset's bounds]
+MIN_ASSET_GAUSSIANS = 100  # fewest opaque Gaussians of an asset
 
 
 def complete(
     scene: Scene, number: int, observed: ObservedSpace, support: Support | None, options: RefineOptions
 ) -> Gaussians:
-    """The completer "library": Gaussians of the best asset where the object was not seen; none if no asset fits."""
+    """The completer "library": Gaussians of the best asset on the unseen sides; none if no asset fits."""
     own = opaque_gaussians(scene, number)
     enough = len(own) >= MIN_REGISTRATION_POINTS
     crop = crop_object(scene, own, SIDE, options.photos) if enough and options.matcher != "none" else None
@@ -63,7 +63,7 @@ def complete(
 
 
 def opaque_gaussians(scene: Scene, number: int) -> Gaussians:
-    """The Gaussians of an object with at least SURFACE_OPACITY."""
+    """The Gaussians of an object whose opacity exceeds SURFACE_OPACITY."""
     g = scene.gaussians
     return g[(g.object_id == number) & (g.opacities > SURFACE_OPACITY) & g.means.isfinite().all(1)]
 
@@ -71,9 +71,9 @@ def opaque_gaussians(scene: Scene, number: int) -> Gaussians:
 def place_whole(
     whole: Gaussians, registration: Registration, own: Gaussians, observed: ObservedSpace, min_fit: float
 ) -> tuple[Gaussians, str]:
-    """Gaussians that a registered whole adds to its part `own`, and a message; none where it does not fit.
+    """Gaussians that a registered whole adds to its seen part `own`, and a message; none if the whole does not fit.
 
-    It fits if its fit is at least `min_fit` and at most MAX_FREE_FRACTION of it is in observed free space.
+    The whole fits if its fit is at least `min_fit` and at most MAX_FREE_FRACTION of it is in observed free space.
     """
     placed = transformed(whole, registration.similarity.to(whole.means.device))
     free = _free_fraction(placed, observed)
@@ -85,17 +85,17 @@ def place_whole(
 
 @lru_cache(maxsize=1)
 def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, RegistrationCloud]]:
-    """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write.
+    """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as written by trainers and `ngff-lab objects`.
 
-    The registration clouds are on `device`, the Gaussians on the CPU. Raises InputError for an empty folder and for
-    assets with too few Gaussians.
+    Registration clouds are on `device`, Gaussians on the CPU. Raises InputError for an empty folder and for assets with
+    too few Gaussians.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; --library takes whole objects, such as `ngff-lab objects` writes")
     found = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".ply" and not p.name.startswith("."))
     files = {p.stem: p for p in found if p.parent == folder}
-    # the last one of each, by path
+    # the last file of each folder, by path
     files.update({p.relative_to(folder).parts[0]: p for p in found if p.parent != folder})
     if not files:
         raise InputError(f"{folder}: holds no .ply; --library takes whole objects, such as `ngff-lab objects` writes")
@@ -112,7 +112,7 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
 def matched_hints(
     options: RefineOptions, crop: ObjectCrop | None, own: Gaussians, whole: Gaussians
 ) -> list[Similarity]:
-    """The place of a whole by --matcher; empty without a matcher, an image of the object, or enough matches."""
+    """The similarity of a whole by --matcher; empty without a matcher, an image of the object, or enough matches."""
     if crop is None or options.matcher == "none":
         return []
     device = pick_device(options.device)
@@ -129,9 +129,10 @@ def _matcher(device: str) -> Matcher:
 def best_asset(
     own: Gaussians, options: RefineOptions, crop: ObjectCrop | None = None
 ) -> tuple[str, Gaussians, Registration] | None:
-    """Name, Gaussians and registration of the asset that fits best: all coarsely, the best candidates accurately.
+    """Name, Gaussians and registration of the asset that fits best; None if no asset could be registered.
 
-    With `crop`, an image of the object, --matcher matches it to each asset.
+    All assets are registered coarsely, and the best candidates accurately. With `crop`, an image of the object,
+    --matcher matches it to each asset.
     """
     device, seed = pick_device(options.device), options.seed
     assets, part = load_library(options.library, device), RegistrationCloud.of(own.to(device), seed)
@@ -155,7 +156,7 @@ def _free_fraction(placed: Gaussians, observed: ObservedSpace) -> float:
 
 
 def unseen_gaussians(own: Gaussians, placed: Gaussians, number: int) -> Gaussians:
-    """The asset's Gaussians away from those of the object, with colours adapted to the photos."""
+    """The asset's Gaussians that are not near Gaussians of the object, with colours adapted to the photos."""
     size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
     near = knn(own.means, placed.means, 1)[0][:, 0] < SEEN_DISTANCE * size
     if not near.any():
@@ -169,7 +170,7 @@ def unseen_gaussians(own: Gaussians, placed: Gaussians, number: int) -> Gaussian
 def _colour_shift(
     own: Gaussians, seen: Gaussians, at: Float[Tensor, "n 3"], neighbours: int = 64
 ) -> Float[Tensor, "n 3"]:
-    """Colour difference between photos and asset, averaged over the nearest points where both are known."""
+    """Difference of the base colours of photos and asset, averaged over the nearest points where both are known."""
     _, nearest_own = knn(own.means, seen.means, 8)
     difference = own.sh[nearest_own, 0].mean(1) - seen.sh[:, 0]
     distance, index = knn(seen.means, at, neighbours)

@@ -1,4 +1,4 @@
-"""The input image of a generator: one object alone on white, upright and centred, from a camera that saw it."""
+"""The input image of a generator: one object alone on white, upright and centred, from a camera that sees it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 
 CROP_FILL = 0.8  # longer side of the object, relative to the side of the crop, as in the public code
-TRAINED_ELEVATIONS = (-5.0, 30.0)  # camera elevations of DiffSplat's training images [degrees]
-MAX_ELEVATION = 75.0  # beyond which the upright direction of an image is undefined [degrees]
-MIN_RELATIVE_VISIBILITY = 0.5  # of the best camera's; among those above it the elevation decides
+TRAINED_ELEVATIONS = (-5.0, 30.0)  # range of the camera elevations of DiffSplat's training images [degrees]
+MAX_ELEVATION = 75.0  # elevation beyond which the upright direction of an image is ill-defined [degrees]
+MIN_RELATIVE_VISIBILITY = 0.5  # visibility relative to the best camera, above which elevation decides between cameras
 SUPERSAMPLING = 3  # pixels rendered per pixel of the crop, in each direction
 
 
@@ -36,19 +36,19 @@ class ObjectCrop:
 
     image: Float[Tensor, "s s 3"]
     elevation: float  # of the camera above the horizontal, seen from the object [degrees]
-    place: Similarity  # DiffSplat's frame to the scene, as estimated from the camera
+    place: Similarity  # from DiffSplat's frame to the scene, as estimated from the camera
     name: str  # of the photo
-    viewmat: Float[Tensor, "4 4"]  # of the camera, and its intrinsics
+    viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
-    coverage: Float[Tensor, "s s"]  # of each pixel by the object, 0..1; the rest is white
+    coverage: Float[Tensor, "s s"]  # coverage of each pixel by the object, 0..1; the rest is white
 
 
 def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = None) -> ObjectCrop | None:
     """Image of the object `own` from the photo that shows it best, or rendered without `photos`; None if not visible.
 
     A virtual camera at the photo's position is rotated towards the object, with a focal length such that the object
-    fills the image. Elevation and approximate pose of the generated object follow from this camera. Raises
-    InputError where `photos` holds no photo of the scene.
+    fills the image. It determines the elevation and the approximate pose of the generated object. Raises InputError if
+    `photos` contains no photo of the scene.
     """
     files = _files(photos, scene) if photos is not None else None
     view = _best(scene, own, files)
@@ -82,7 +82,10 @@ def _files(photos: Path, scene: Scene) -> dict[int, Path]:
 
 
 def _best(scene: Scene, own: Gaussians, files: dict[int, Path] | None) -> int | None:
-    """The camera that shows most of the object, preferably uncropped; of similar ones that nearest in elevation."""
+    """The camera that shows most of the object, preferably uncropped; None if no camera shows it.
+
+    Among cameras that show similar amounts, elevation decides: nearest to TRAINED_ELEVATIONS.
+    """
     visible, tilt, centre = {}, {}, own.means.median(0).values
     for i in range(len(scene.cameras)) if scene.cameras is not None else ():
         viewmat, elevation = scene.cameras.viewmats[i], _elevation(centres(scene.cameras.viewmats[i][None])[0], centre)
@@ -108,7 +111,7 @@ def _elevation(eye: Float[Tensor, "3"], centre: Float[Tensor, "3"]) -> float:
 
 
 def _rotated_camera(scene: Scene, own: Gaussians, view: int, side: int) -> tuple[Tensor, Tensor, Tensor] | None:
-    """The camera of a view rotated to the centre of the object: viewmat, K, and that centre; None if not visible."""
+    """The camera of a view, rotated towards the object's centre: viewmat, K and this centre; None if not visible."""
     eye = centres(scene.cameras.viewmats[view][None])[0]
     centre = own.means.median(0).values
     for _ in range(2):  # the first pass finds the centre of the outline, the second its size
@@ -139,7 +142,7 @@ def _mask(
 def _rotated_photo(
     photo: Float[Tensor, "h w 3"], scene: Scene, view: int, viewmat: Tensor, K: Tensor, side: int
 ) -> Float[Tensor, "s s 3"]:
-    """An undistorted photo warped to the rotated camera by K_photo R_photo R^T K^-1; white outside of it."""
+    """Warp an undistorted photo to the rotated camera by the homography K_photo R_photo R^T K^-1; white outside."""
     width, height = scene.cameras.sizes[view].tolist()
     K_photo = resize(scene.cameras.Ks[view], photo.shape[1] / width, photo.shape[0] / height).double()
     R = (scene.cameras.viewmats[view, :3, :3] @ viewmat[:3, :3].mT).double()

@@ -30,7 +30,7 @@ UPSCALERS = {
 }  # fmt: skip
 MATCHERS = ("none", "aliked-lightglue")
 WHOLE_OBJECTS = ("library", "diffsplat")  # completers that register a whole object
-CONCURRENT = {"close", "none"}  # completers of which several run at a time: they use the CPU alone
+CONCURRENT = {"close", "none"}  # completers that run for several objects at once, since they only use the CPU
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Outlier removal: Gaussians of an object that float around it or are larger than it."""
+"""Outlier removal: finds Gaussians of an object that float around it or are too large for it."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from torch import Tensor
 from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians
 
-MIN_LOG_SPACING_MAD = 0.2  # of the log distance to neighbours; keeps the corners of evenly sampled surfaces
+MIN_LOG_SPACING_MAD = 0.2  # lower bound of the MAD of log distances to neighbours; keeps corners of even samples
 
-MIN_GAUSSIANS = 16  # of an object that is examined
+MIN_GAUSSIANS = 16  # fewest Gaussians of an object that is tested
 
 
 def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
-    """Gaussians of objects that are far from the rest of their object, isolated, or of its size.
+    """Mask of the Gaussians that are far from the rest of their object, isolated, or nearly as large as the object.
 
-    The distance score is the modified z-score (Iglewicz and Hoaglin 1993) of the distance to the median centre, the
+    The distance score is the modified z-score (Iglewicz and Hoaglin 1993) of the distance from the median centre, the
     isolation score that of the log distance to the 8th neighbour. A Gaussian is an outlier if the distance score
-    exceeds `limit` and the isolation score half of it (the end of a rope is far, but not isolated), if the isolation
-    score exceeds twice the `limit`, or if it is non-finite or larger than 0.35 of the object.
+    exceeds `limit` and the isolation score exceeds half of `limit` (the end of a rope is far, but not isolated), if the
+    isolation score exceeds twice `limit`, or if the Gaussian is non-finite or larger than 0.35 of the object.
 
-    An object of which more than half would be removed keeps all its Gaussians.
+    An object that would lose more than half of its Gaussians keeps all of them.
     """
     out = ~(g.means.isfinite().all(1) & g.scales.isfinite().all(1) & g.opacities.isfinite()) & (g.object_id > 0)
     for number in g.object_id.unique().tolist():
@@ -37,7 +37,7 @@ def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
         size = float((core.amax(0) - core.amin(0)).norm()) if len(core) else 0.0
         oversized = g.scales[members].amax(1) > max(0.35 * size, 1e-12)
         stray = ((far > limit) & (isolated > 0.5 * limit)) | (isolated > 2 * limit) | (oversized & (size > 0))
-        if float(stray.float().mean()) < 0.5:  # a majority cannot be outliers
+        if float(stray.float().mean()) < 0.5:  # the majority cannot be outliers
             out[members[stray]] = True
     return out
 

@@ -1,8 +1,8 @@
-"""Registration of a whole object to an observed part of it: the similarity that maps the whole to the part.
+"""Registration of a whole object to an observed part of it: estimates the similarity from the whole to the part.
 
-Feature matches give many pose hypotheses (registration_hypotheses.py); the best are refined by Gauss-Newton, in the
-last round against the whole with as much noise as the part has. Positions and colours are used throughout. It is
-tested for parts with 60 % of the surface, any rotation and scales 0.5 to 2. Computed on the device of the Gaussians.
+Feature matches give many pose hypotheses (registration_hypotheses.py), of which the best are refined by Gauss-Newton;
+in the last round the whole gets the same noise as the part. Positions and colours are used throughout. Tested for parts
+with 60 % of the surface, any rotation and scales of 0.5 to 2. Runs on the device of the Gaussians.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from stages.core.scene.gaussians import Gaussians
 from stages.refine.registration_cloud import COLOUR_WEIGHT, SMOOTHING_RADIUS, RegistrationCloud
 from stages.refine.registration_hypotheses import PoseHypotheses, misfit, pose_hypotheses
 
-MIN_REGISTRATION_POINTS = 100  # of part and of whole
-NORMAL_WEIGHT = 0.7  # of the distance along the normal; the rest is for all directions, and bounds tangential shifts
-HINT_PERTURBATIONS = 300  # poses tried around a hint
-MAX_TINT = 15 * COLOUR_WEIGHT  # largest colour offset attributed to illumination [diameters]
+MIN_REGISTRATION_POINTS = 100  # fewest points of the part and of the whole
+NORMAL_WEIGHT = 0.7  # weight of point-to-plane distances; the rest is point-to-point and bounds tangential shifts
+HINT_PERTURBATIONS = 300  # number of poses tried around a hint
+MAX_TINT = 15 * COLOUR_WEIGHT  # largest colour offset attributed to illumination [diameter]
 
 
 class Target(NamedTuple):
-    """A cloud to register to, and its search structure."""
+    """The cloud to which another is registered, and its search structure."""
 
     cloud: RegistrationCloud
     tree: KDTree | BruteForce
@@ -39,19 +39,22 @@ class Target(NamedTuple):
 class Registration:
     """Result of a registration."""
 
-    similarity: Similarity  # whole to part
-    fit: float  # 1: all points of the part agree in position and colour; 0: none within 6 % of the diameter
+    similarity: Similarity  # from the whole to the part
+    fit: float  # 1: all points of the part agree in position and colour; 0: no point within 6 % of the diameter
 
 
 def register(part: Gaussians, whole: Gaussians, seed: int = 0, hints: Sequence[Similarity] = ()) -> Registration | None:
-    """The similarity from `whole` to `part`, optionally near `hints`; None without hints or consistent features."""
+    """Estimate the similarity from `whole` to `part`; poses near `hints`, which map whole to part, are tried too.
+
+    Returns None for too few points, or if there are neither hints nor consistent features.
+    """
     return register_clouds(RegistrationCloud.of(part, seed), RegistrationCloud.of(whole, seed), seed, hints)
 
 
 def register_clouds(
     part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hints: Sequence[Similarity] = ()
 ) -> Registration | None:
-    """As `register`, for clouds that exist already; hints map the whole to the part."""
+    """As `register`, for registration clouds."""
     coarse = coarse_registration(part, whole, seed, hints)
     return fine_registration(coarse, part, whole, seed) if len(coarse) else None
 
@@ -59,7 +62,7 @@ def register_clouds(
 def coarse_registration(
     part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hints: Sequence[Similarity] = ()
 ) -> PoseHypotheses:
-    """At most 2 candidate poses, best first, accurate to about 3 degrees; empty where no features agree.
+    """At most 2 candidate poses, best first, accurate to about 3 degrees; empty if no features agree.
 
     Poses around `hints` (whole to part) are tried too.
     """
@@ -82,7 +85,7 @@ def coarse_registration(
 def fine_registration(
     poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0
 ) -> Registration:
-    """The best of coarse poses and perturbations of them, refined as far as the noise of the part allows."""
+    """Refine the best of the coarse poses and their perturbations, against a whole with the noise of the part."""
     order, size = _order(part, seed), float(poses.scale[0])
     noise, tint = _noise_and_tint(poses[:1], part, whole)
     noisy = whole.as_seen(size * noise, tint, SMOOTHING_RADIUS * size, seed)
@@ -90,7 +93,7 @@ def fine_registration(
     target = Target(noisy, tree)
     poses = gauss_newton(poses.perturbed(5, seed), part, order[:700], target, rounds=10, floor=0.03)
     poses = _best(poses, part, tree, order, 1)
-    for _ in range(3):  # the refined criterion differs from that of selection
+    for _ in range(3):  # keeps intermediate poses, since Gauss-Newton minimises another criterion than `misfit`
         refined = gauss_newton(poses[-1:], part, order[:2500], target, rounds=7, floor=0.02)
         poses = PoseHypotheses.joined(poses, refined)
     poses = _best(poses, part, tree, order, 1)
@@ -99,12 +102,12 @@ def fine_registration(
 
 
 def coarse_fit(poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> float:
-    """Fit of the first of coarse poses; 0 without any."""
+    """Fit of the first coarse pose; 0 if there is none."""
     return 1 - float(misfit(poses[:1], part.points, part.colours, whole.tree())) if len(poses) else 0.0
 
 
 def _order(part: RegistrationCloud, seed: int) -> Int[Tensor, "n"]:
-    """A random permutation of the part's points, of which prefixes are random samples."""
+    """A random permutation of the part's points, so that any prefix is a random sample."""
     order = torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
     return order.to(part.points.device)
 
@@ -120,7 +123,7 @@ def _best(
 def _noise_and_tint(
     pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud
 ) -> tuple[float, Float[Tensor, "3"]]:
-    """Noise of a part relative to its whole: standard deviation off the surface [diameters], and colour offset.
+    """Noise of the part relative to the whole: standard deviation normal to the surface [diameter], and colour offset.
 
     Noise thickens thin parts and widens their edges; adding the same noise to the whole removes this bias. The colour
     offset, due to illumination, is limited to MAX_TINT.
@@ -142,9 +145,9 @@ def gauss_newton(
 ) -> PoseHypotheses:
     """Gauss-Newton on a robust one-sided Chamfer distance in position and colour, batched over poses.
 
-    Nearest neighbours are found in position and colour; their distance is weighted mostly along the normal (Chen and
+    Nearest neighbours are found in position and colour. Their distance is weighted mostly along the normal (Chen and
     Medioni 1992) and by 1 / (1 + (d / tau)^2)^2 (Geman and McClure 1985), where tau is 2.5 times the median distance,
-    at least `floor` [diameters]. Distances are in units of the part: in those of the whole, shrinking the part would
+    at least `floor` [diameter]. Distances are in units of the part: in those of the whole, shrinking the part would
     always reduce them.
     """
     x, colours = part.points[some].double(), part.colours[some].double()
@@ -164,7 +167,7 @@ def gauss_newton(
 def _step(
     y: Float[Tensor, "h k 3"], error: Float[Tensor, "h k 3"], normals: Float[Tensor, "h k 3"], weight: Tensor
 ) -> Float[Tensor, "h 7"]:
-    """Gauss-Newton step: rotation [rad], shift and log scale about the mean of y."""
+    """Gauss-Newton step (rotation [rad], translation, log scale) about the mean of y."""
     arm = y - y.mean(1, keepdim=True)
     axes = [(normals, NORMAL_WEIGHT), *((axis.expand_as(y), 1 - NORMAL_WEIGHT) for axis in torch.eye(3).to(y))]
     system = y.new_zeros(len(y), 8, 8)
@@ -178,7 +181,7 @@ def _step(
 
 
 def _stepped(poses: PoseHypotheses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> PoseHypotheses:
-    """Poses after a Gauss-Newton step."""
+    """Apply a Gauss-Newton step to poses, about the points `about`."""
     angle = step[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-12)
     rotation = matrix(torch.cat([(angle / 2).cos(), step[:, :3] / angle * (angle / 2).sin()], 1))
     growth = step[:, 6].exp()
@@ -187,7 +190,7 @@ def _stepped(poses: PoseHypotheses, about: Float[Tensor, "h 3"], step: Float[Ten
 
 
 def to_normalised_frames(place: Similarity, part: RegistrationCloud, whole: RegistrationCloud) -> PoseHypotheses:
-    """Pose (part to whole, normalised frames) of a similarity (whole to part, scene units)."""
+    """Convert a similarity (whole to part, scene units) to a pose (part to whole, normalised frames)."""
     place = place.to(part.centre.device)
     R = place.rotation.mT
     scale = part.diameter / (place.scale * whole.diameter)
@@ -196,7 +199,7 @@ def to_normalised_frames(place: Similarity, part: RegistrationCloud, whole: Regi
 
 
 def _to_scene_units(pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> Similarity:
-    """Similarity (whole to part, scene units) of a pose (part to whole, normalised frames)."""
+    """Convert a pose (part to whole, normalised frames) to a similarity (whole to part, scene units)."""
     scale, R = float(pose.scale[0]), pose.rotation[0].mT
     growth = part.diameter / (scale * whole.diameter)
     shift = part.centre - part.diameter / scale * R @ pose.translation[0] - growth * R @ whole.centre

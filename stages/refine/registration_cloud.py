@@ -1,4 +1,4 @@
-"""Gaussians as a thinned point cloud for registration: smoothed points, normals and colours, of diameter 1."""
+"""Point clouds for registration: smoothed, thinned points with normals and colours, normalised to diameter 1."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 from stages.core.geometry.symmetric_matrices import eigh
 from stages.core.scene.gaussians import Gaussians
 
-MAX_RAW_POINTS = 30_000  # that points are smoothed from
+MAX_RAW_POINTS = 30_000  # most points before smoothing
 TARGET_POINTS = 3000  # approximate number of smoothed points
-SMOOTHING_RADIUS = 0.03  # [diameters of the whole object]
-MAX_NEIGHBOURS = 32  # that one point is smoothed from
-MIN_NEIGHBOURS = 4  # of a point with a normal; others are dropped
-COLOUR_WEIGHT = 1 / 400  # diameters per CIELAB unit: 20 units, red against orange, are 0.05
-LIGHTNESS_WEIGHT = 0.6  # relative to hue, since shading changes lightness
+SMOOTHING_RADIUS = 0.03  # radius of the neighbourhood for smoothing [diameter of the whole object]
+MAX_NEIGHBOURS = 32  # most neighbours from which a point is smoothed
+MIN_NEIGHBOURS = 4  # fewest neighbours of a point that is kept, as its normal needs them
+COLOUR_WEIGHT = 1 / 400  # diameters per CIELAB unit: 20 units, such as red against orange, are 0.05
+LIGHTNESS_WEIGHT = 0.6  # weight of lightness relative to hue, since shading changes lightness
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,17 @@ class RegistrationCloud:
     Random numbers are drawn on the CPU, so that a seed gives the same cloud on every device.
     """
 
-    points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]  # of either sign
-    colours: Float[Tensor, "n 3"]  # CIELAB, lightness times LIGHTNESS_WEIGHT [diameters]
-    raw: Float[Tensor, "m 3"]  # not smoothed
+    points: Float[Tensor, "n 3"]  # smoothed
+    normals: Float[Tensor, "n 3"]  # of arbitrary sign
+    colours: Float[Tensor, "n 3"]  # CIELAB with weighted lightness, see `cloud_colours` [diameter]
+    raw: Float[Tensor, "m 3"]  # points before smoothing
     raw_colours: Float[Tensor, "m 3"]
-    centre: Float[Tensor, "3"]
-    diameter: float  # [units of the scene]
+    centre: Float[Tensor, "3"]  # [scene units]
+    diameter: float  # [scene units]
 
     @staticmethod
     def of(g: Gaussians, seed: int = 0) -> RegistrationCloud:
-        """The cloud of Gaussians, by means and base colours; at least two means must differ."""
+        """The cloud of the means and base colours of Gaussians; at least two means must differ."""
         generator = torch.Generator().manual_seed(seed)
         centre, across = g.means.median(0).values, diameter(g.means)
         sample = torch.randperm(len(g), generator=generator)[:MAX_RAW_POINTS].to(g.means.device)
@@ -49,25 +49,28 @@ class RegistrationCloud:
         return RegistrationCloud(*smooth_points(points, colours, SMOOTHING_RADIUS), points, colours, centre, across)
 
     def as_seen(self, sigma: float, tint: Float[Tensor, "3"], radius: float, seed: int = 0) -> RegistrationCloud:
-        """The same object with position noise of standard deviation `sigma` [diameters] and a colour offset `tint`."""
+        """The same object with position noise of standard deviation `sigma` [diameter] and a colour offset `tint`.
+
+        Points are smoothed within `radius` [diameter].
+        """
         error = sigma * torch.randn(self.raw.shape, generator=torch.Generator().manual_seed(seed))
         points, normals, colours = smooth_points(self.raw + error.to(self.raw), self.raw_colours + tint, radius)
         return replace(self, points=points, normals=normals, colours=colours)
 
     def tree(self) -> KDTree | BruteForce:
-        """Search structure for nearest points in joint position and colour."""
+        """Search structure for nearest points in the joint space of position and colour."""
         return neighbour_index(torch.cat([self.points, self.colours], 1))
 
 
 def cloud_colours(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Weighted CIELAB colours [diameters]; computed on the CPU."""
+    """CIELAB colours times COLOUR_WEIGHT and LIGHTNESS_WEIGHT [diameter]; computed on the CPU."""
     pixels = rgb.clamp(0, 1).float().cpu().numpy()[None]
     values = torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB)[0])
     return (values * torch.tensor([LIGHTNESS_WEIGHT, 1.0, 1.0]) * COLOUR_WEIGHT).to(rgb.device)
 
 
 def diameter(points: Float[Tensor, "n 3"]) -> float:
-    """Approximate largest distance of two points: four steps from a point to the one farthest from it."""
+    """Approximate largest distance between two points, by four steps from a point to the farthest point."""
     at, best = points[0], 0.0
     for _ in range(4):
         distance = (points - at).norm(dim=1)
@@ -78,7 +81,10 @@ def diameter(points: Float[Tensor, "n 3"]) -> float:
 def smooth_points(
     points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], radius: float
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Evenly spaced points projected onto the plane of their neighbours within `radius`, normals, mean colours."""
+    """Smooth and thin a cloud; returns points, normals and mean colours.
+
+    Evenly spaced points are projected onto the fitted plane of their neighbours within `radius`.
+    """
     picked = thin_indices(points, TARGET_POINTS)
     distance, index = neighbour_index(points).query(points[picked], MAX_NEIGHBOURS, radius)
     near = distance.isfinite()[..., None].float()
@@ -94,7 +100,10 @@ def smooth_points(
 
 
 def thin_indices(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "m"]:
-    """Indices of one point per cell, with a cell size that leaves about `count` (the number of cells ~ size^-2)."""
+    """Indices of one point per cell of a grid; the cell size is iterated so that about `count` points are left.
+
+    The number of cells of a surface is proportional to size^-2.
+    """
     low, cell = points.amin(0), float((points.amax(0) - points.amin(0)).max()) / 40
     for _ in range(3):
         cells = ((points - low) / cell).long()

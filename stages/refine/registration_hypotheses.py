@@ -1,4 +1,4 @@
-"""Hypotheses of the similarity between two clouds, from triples of matched local features that agree."""
+"""Hypotheses of the similarity between two clouds, from consistent triples of matched local features."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stages.core.geometry.neighbours import BruteForce, KDTree
 from stages.core.geometry.rotations import matrix, nearest_rotation
 from stages.refine.registration_cloud import COLOUR_WEIGHT, RegistrationCloud
 
-FEATURE_RADII = (0.07, 0.14, 0.28)  # of the described neighbourhoods [diameters of the whole object]
-SCALES = (1.0, 1.15, 1.32, 1.52)  # tried ratios of the diameters of whole and part, since features have no scale
-SCALE_TOLERANCE = 1.18  # ratio of an edge to its expected length; more than the step between SCALES
-KEYPOINTS, MATCHES_PER_KEYPOINT = 500, 4  # of the part
-TARGETS = 2000  # points of the whole that keypoints are matched to
-TRIPLES = 40_000  # of matches, drawn for each scale
-MAX_HYPOTHESES = 6000
-MAX_RESIDUAL = 0.06  # joint distance in position and colour at which residuals are truncated [diameters]
+FEATURE_RADII = (0.07, 0.14, 0.28)  # radii of the described neighbourhoods [diameter of the whole object]
+SCALES = (1.0, 1.15, 1.32, 1.52)  # ratios of the diameters of whole and part that are tried, as features have no scale
+SCALE_TOLERANCE = 1.18  # largest ratio of an edge to its expected length; more than the step between SCALES
+KEYPOINTS, MATCHES_PER_KEYPOINT = 500, 4  # keypoints of the part, and matches of each
+TARGETS = 2000  # points of the whole to which keypoints are matched
+TRIPLES = 40_000  # triples of matches drawn for each scale
+MAX_HYPOTHESES = 6000  # most hypotheses that are returned
+MAX_RESIDUAL = 0.06  # joint distance in position and colour at which residuals are truncated [diameter]
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class PoseHypotheses:
 
     @staticmethod
     def joined(*parts: PoseHypotheses) -> PoseHypotheses:
-        """The concatenation of several sets."""
+        """Concatenate sets of hypotheses."""
         return PoseHypotheses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PoseHypotheses)))
 
     def perturbed(self, copies: int, seed: int) -> PoseHypotheses:
-        """These and `copies` random perturbations of each by about 5 degrees, 4 % of scale and 2 % of the diameter."""
+        """These poses and `copies` perturbations of each, by about 5 degrees, 4 % of scale and 2 % of the diameter."""
         rng = torch.Generator().manual_seed(seed)
         at = self.scale.device
         some = self[torch.arange(len(self), device=at).repeat(copies)]
@@ -66,11 +66,11 @@ class PoseHypotheses:
         return PoseHypotheses.joined(self, PoseHypotheses(some.scale * grown, turn @ some.rotation, moved))
 
     def distinct(self, count: int, degrees: float, shift: float) -> PoseHypotheses:
-        """The first `count` that differ from all before them by at least an angle or a shift [diameters]."""
+        """The first `count` poses that differ from all kept before by at least an angle or a shift [diameter]."""
         traces = self.rotation.flatten(1) @ self.rotation.flatten(1).mT
         rotated = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
         shifted = (self.translation[:, None] - self.translation).norm(dim=2)
-        alike = ((rotated < degrees) & (shifted < shift)).tolist()  # a single copy from the GPU
+        alike = ((rotated < degrees) & (shifted < shift)).tolist()  # one copy from the GPU
         kept: list[int] = []
         for i in range(len(self)):
             if len(kept) < count and not any(alike[i][j] for j in kept):
@@ -81,9 +81,10 @@ class PoseHypotheses:
 def misfit(
     poses: PoseHypotheses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: KDTree | BruteForce
 ) -> Float[Tensor, "h"]:
-    """Truncated mean squared distance in position and colour of the part's points from the whole, 0 to 1.
+    """Mean squared distance of the part's points from the whole in position and colour, truncated to 0..1.
 
-    In units of MAX_RESIDUAL^2. One-sided, since the part is incomplete; truncated, for robustness to outliers.
+    The unit is MAX_RESIDUAL^2. The distance is one-sided, since the part is incomplete, and truncated for robustness to
+    outliers.
     """
     moved = poses(points)
     distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=MAX_RESIDUAL)
@@ -91,11 +92,10 @@ def misfit(
 
 
 def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:
-    """Rotation-invariant features of the neighbourhoods of some points, of radii FEATURE_RADII times `unit`.
+    """Rotation-invariant features of the neighbourhoods of the points `at`, with radii of FEATURE_RADII times `unit`.
 
-    For each neighbourhood: mean and standard deviation of colour, the triple principal standard deviations of
-    position, and the offset of the mean from the point, along the normal and in total. Each is divided by its typical
-    variation.
+    For each neighbourhood: mean and standard deviation of colour, the three principal standard deviations of position,
+    and the offset of the mean from the point, along the normal and in total. Each is divided by its typical variation.
     """
     x, colour, q = cloud.points, cloud.colours / COLOUR_WEIGHT, cloud.points[at]
     squared = torch.cdist(q, x).square()
@@ -117,10 +117,10 @@ def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) 
 
 
 def pose_hypotheses(part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0) -> PoseHypotheses:
-    """Similarities from triples of matches with consistent distances and angles of normals.
+    """Similarities from triples of matches with consistent distances and angles between normals.
 
-    Source: Fischler and Bolles 1981; agreement of edges before fitting as in Rusu et al. 2009, "Fast point feature
-    histograms (FPFH) for 3D registration".
+    Source: RANSAC by Fischler and Bolles 1981; comparison of edges before fitting as in Rusu et al. 2009, "Fast point
+    feature histograms (FPFH) for 3D registration".
     """
     generator, at = torch.Generator().manual_seed(seed), part.points.device
     targets = torch.randperm(len(whole.points), generator=generator)[:TARGETS].to(at)
@@ -142,7 +142,7 @@ def pose_hypotheses(part: RegistrationCloud, whole: RegistrationCloud, seed: int
 def _consistent(
     part: RegistrationCloud, whole: RegistrationCloud, i: Int[Tensor, "d 3"], j: Int[Tensor, "d 3"], size: float
 ):
-    """Points of the triples that are large enough, keep their proportions and have about the assumed scale."""
+    """Points of the triples that are large enough, have similar proportions and roughly the assumed scale."""
     a, b = part.points[i], whole.points[j]
     edges_a, edges_b = ((p - p.roll(1, 1)).norm(dim=2) for p in (a, b))
     ratio = size * edges_b / edges_a.clamp_min(1e-9)

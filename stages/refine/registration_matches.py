@@ -1,9 +1,9 @@
-"""Pose of a whole object by learned matches between an image of the seen part and renderings of the whole.
+"""Pose of a whole object from learned matches between an image of the seen part and renderings of the whole.
 
-The whole is rendered from all around, the image is matched to every rendering, and the matches with the best one are
-lifted to points of both surfaces, from which RANSAC estimates a similarity. It is a hint: registration.py tries it
-beside its own hypotheses, and the best by position and colour wins.
-Source: the paper's refinement, with SuperGlue there; Lindenberger et al. 2023, "LightGlue: Local feature matching at
+The whole is rendered from all around, and the image is matched to every rendering. The matches with the best rendering
+are lifted to points on both surfaces, from which RANSAC estimates a similarity. It is only a hint: registration.py
+tries it with its own hypotheses and chooses the best by position and colour.
+Source: the paper's refinement, which uses SuperGlue; Lindenberger et al. 2023, "LightGlue: Local feature matching at
 light speed"; Fischler and Bolles 1981, "Random sample consensus".
 """
 
@@ -22,23 +22,24 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians
 from stages.refine.registration_hypotheses import PoseHypotheses
 
-YAWS, PITCHES = 20, (0.0, 9.0, 18.0, 27.0, 36.0)  # of the renderings [degrees], as in the public code
-SIDE, FOCAL, RADIUS = 256, 1.374, 1.6  # of them [px, sides (40 degrees), longest extents of the object]
-MAX_KEYPOINTS, MIN_SCORE = 1024, 0.02  # of an image
-HYPOTHESES, SAMPLE = 256, 6  # of RANSAC, and matches of each
-MAX_ERROR = 0.05  # distance up to which a match agrees with a hypothesis [longest extents of the part]
-MIN_ALPHA = 0.5  # opacity above which a pixel shows a surface
+YAWS, PITCHES = 20, (0.0, 9.0, 18.0, 27.0, 36.0)  # number of yaws, and pitches [degrees], as in the public code
+# Size of the renderings [px], focal length [sides; 40 degrees] and camera distance [longest extent of the object].
+SIDE, FOCAL, RADIUS = 256, 1.374, 1.6
+MAX_KEYPOINTS, MIN_SCORE = 1024, 0.02  # most keypoints of an image, and their smallest score
+HYPOTHESES, SAMPLE = 256, 6  # hypotheses of RANSAC, and matches per hypothesis
+MAX_ERROR = 0.05  # largest distance between matched points of an inlier [longest extent of the part]
+MIN_ALPHA = 0.5  # alpha above which a pixel shows a surface
 
 
 class View(NamedTuple):
-    """An image of an object alone, with the points that it shows."""
+    """An image of an object alone, with the surface point of each pixel."""
 
     image: Float[Tensor, "s s 3"]
-    points: Float[Tensor, "s s 3"]  # nan where it shows none
+    points: Float[Tensor, "s s 3"]  # nan for pixels without a surface
 
 
 def matched_place(matcher: Matcher, part: View, whole: Gaussians, seed: int = 0) -> Similarity | None:
-    """The similarity from `whole` to the part by matches of its image; None where too few agree."""
+    """The similarity from `whole` to the part, by matches with its image; None if there are too few inliers."""
     keypoints, descriptors = matcher.features.keypoints_of(part.image, MAX_KEYPOINTS, MIN_SCORE)
     best: tuple[Tensor, Tensor] | None = None
     for view in views_around(whole):
@@ -53,7 +54,7 @@ def matched_place(matcher: Matcher, part: View, whole: Gaussians, seed: int = 0)
 
 
 def view_of(part: Gaussians, image: Float[Tensor, "s s 3"], viewmat: Tensor, K: Tensor) -> View:
-    """An image with the points of the object that its camera shows."""
+    """An image, with the surface points of the object that its camera sees."""
     height, width = image.shape[:2]
     drawn = rasterise(part, viewmat[None], K[None], width, height)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -64,7 +65,7 @@ def view_of(part: Gaussians, image: Float[Tensor, "s s 3"], viewmat: Tensor, K: 
 
 
 def views_around(whole: Gaussians) -> list[View]:
-    """Renderings of an object from all around, on white."""
+    """Render an object from all around, on white."""
     low, high = whole.means.amin(0), whole.means.amax(0)
     K = intrinsics(SIDE, SIDE, FOCAL * SIDE).to(low)
     views = []
@@ -76,14 +77,14 @@ def views_around(whole: Gaussians) -> list[View]:
 
 
 def _lifted(view: View, keypoints: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
-    """The points that an image shows at some pixels."""
+    """The surface points at keypoints of an image."""
     side = torch.tensor([view.image.shape[1], view.image.shape[0]]).to(keypoints) - 1
     x, y = keypoints.floor().clamp_min(0).minimum(side).long().unbind(1)
     return view.points[y, x]
 
 
 def ransac_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], seed: int) -> Similarity | None:
-    """The similarity that most matched points agree with, source to target; None below SAMPLE agreeing ones."""
+    """The similarity from source to target with most inliers, fitted to them; None with fewer than SAMPLE inliers."""
     if len(source) < SAMPLE:
         return None
     rng = torch.Generator().manual_seed(seed)

@@ -52,7 +52,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
 
 
 def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # noqa: B008 -- frozen
-    """Outlier removal, object completion, background filling; Gaussians are added only where the photos show none.
+    """Remove outliers, complete objects and fill the background; Gaussians are added only where photos show none.
 
     A scene with objects on a wall and no floor is rotated so that the wall becomes the floor, and rotated back.
     """
@@ -66,7 +66,7 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
 
 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
-    """The three steps for objects on `support`."""
+    """Run the three steps for objects on `support`."""
     completer = choose(BACKENDS, "--completer", options.chosen)
     g = scene.gaussians
     stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
@@ -100,10 +100,11 @@ def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> S
 def _hidden_by_objects(
     g: Gaussians, support: Support | None, observed: ObservedSpace
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """The Gaussians with labels, and which of the unlabelled ones within and next to objects no camera sees.
+    """The Gaussians, and a mask of the unlabelled Gaussians in and next to objects that no camera sees.
 
-    Those that one sees stay as labelled, as `segment` has cut the objects' outlines in the views. Without cameras none
-    is known to be seen, and all take the label of their object.
+    Unlabelled Gaussians that a camera sees stay unlabelled, as `segment` has cut the outlines of objects in the views.
+    Without cameras visibility is unknown: then the mask is empty, and Gaussians in and next to objects get the label of
+    the object.
     """
     grown = grow_objects(g, support, _growth_radius(g))
     if not observed.views:
@@ -112,7 +113,7 @@ def _hidden_by_objects(
 
 
 def with_raw(whole: Scene, raw: Scene) -> Scene:
-    """`whole` with the K objects of `raw` added as objects K + 1 to 2 K, "(raw)" appended to their names."""
+    """Add the K objects of `raw` to `whole` as objects K + 1 to 2 K, with "(raw)" appended to their names."""
     g = raw.gaussians[raw.gaussians.object_id > 0]
     count = int(g.object_id.max())
     copies = tuple(replace(o, id=o.id + count, name=f"{o.name} (raw)") for o in whole.objects)

@@ -1,4 +1,4 @@
-"""Super-resolution of the image that a generator gets, as the paper's refinement does it."""
+"""Super-resolution of the input image of a generator, as in the paper's refinement."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from stages.core.models.osediff.weights import find, load
 from stages.refine.object_crop import ObjectCrop
 from stages.refine.options import RefineOptions
 
-RESTORED_SIDE = 768  # of the image that is restored [px], as in the paper
+RESTORED_SIDE = 768  # side of the image that is restored, as in the paper [px]
 
 
 def no_upscaler(options: RefineOptions) -> None:
-    """The upscaler "none"."""
+    """The upscaler "none": there is no network."""
 
 
 def osediff(options: RefineOptions) -> OSEDiff:
-    """The upscaler "osediff"; raises InputError where its weights are missing or damaged."""
+    """The upscaler "osediff". Raises InputError if its weights are missing or damaged."""
     return _model(options.weights, pick_device(options.device))
 
 
@@ -34,14 +34,14 @@ def _model(weights: Path | None, device: str) -> OSEDiff:
 
 
 def weights_file() -> Path:
-    """Path of OSEDiff's low-rank updates; raises InputError where some of its files are missing."""
+    """Path of OSEDiff's low-rank updates (LoRA). Raises InputError if any of its files is missing."""
     return find().lora
 
 
 def upscaled(crop: ObjectCrop, model: OSEDiff, side: int, prompt: str, seed: int) -> ObjectCrop:
-    """The crop with restored detail, reduced to `side`; what the object does not cover stays white.
+    """Restore detail of the crop and reduce it to `side`; pixels outside the object stay white.
 
-    The paper removes the background after the restoration, by another network.
+    The paper instead removes the background after the restoration, by another network.
     """
     image = model.restore(crop.image, prompt, seed)
     image = torch.where(crop.coverage[..., None] > 0, image, 1.0)

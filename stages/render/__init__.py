@@ -1,1 +1,1 @@
-"""Stage render: trajectory or scene -> video or image."""
+"""Rendering: trajectory or scene -> video or image."""

@@ -19,7 +19,7 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Trajectory
 
 EXPECTED = "a trajectory (.h5) or a scene (.ply)"
-STATIC_DURATION, STATIC_FPS = 4.0, 30.0  # of a video in which only the camera moves [s], [1/s]
+STATIC_DURATION, STATIC_FPS = 4.0, 30.0  # duration [s] and frame rate [1/s] of a video in which only the camera moves
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Animation:
     scene: Scene
     trajectory: Trajectory | None = None
     frozen: int | None = None  # index of the only frame to render
-    device: str = "cpu"  # where the Gaussians of a trajectory are computed
+    device: str = "cpu"  # on which the Gaussians of a trajectory are computed
 
     @property
     def is_moving(self) -> bool:
@@ -54,14 +54,14 @@ class Animation:
         return [i / fps for i in range(int(duration * fps + 1e-6) + 1)]
 
     def frame_index(self, time: float) -> float:
-        """Fractional index of a time among the stored frames; times within rounding of a frame give its index."""
+        """Fractional index of a time among the stored frames, rounded if it is a frame within rounding errors."""
         if not self.is_moving:
             return float(self.frozen or 0)
         index = min(time * self.fps, len(self.trajectory) - 1.0)
         return float(round(index)) if abs(index - round(index)) < 1e-4 else index
 
     def gaussians(self, time: float) -> Gaussians:
-        """The Gaussians at a time: the nearest of dense frames, or keypoints interpolated linearly in time."""
+        """The Gaussians at `time` [s]: the nearest frame of a dense trajectory, else from interpolated keypoints."""
         if self.trajectory is None:
             return self.scene.gaussians
         if self.trajectory.dense:
@@ -73,7 +73,7 @@ class Animation:
         return Skinning(self.scene.gaussians.to(self.device), self.trajectory.binding, self.trajectory.keypoints)
 
     def interpolate(self, time: float, values: Float[Tensor, "t *b"]) -> Float[Tensor, "*b"]:
-        """A stored series at a time, linear between frames."""
+        """Interpolate a stored series linearly at `time` [s]."""
         index = self.frame_index(time)
         first = int(index)
         last = min(first + 1, len(values) - 1)

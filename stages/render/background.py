@@ -1,4 +1,4 @@
-"""Background behind the objects: the scene's own, another scene's, a colour or a photo."""
+"""The background behind the objects: that of the scene, of another scene, a colour or a photo."""
 
 from __future__ import annotations
 
@@ -48,7 +48,10 @@ class RenderBackground:
 
 
 def open_background(choice: str | None, scene: Scene) -> RenderBackground:
-    """The background for a value of --background; of another scene only Gaussians without an object are used."""
+    """Open the background of --background; from another scene only Gaussians without an object are used.
+
+    Raises InputError for other values.
+    """
     if choice is None:
         return RenderBackground(colour=scene.background or WHITE)
     if choice.startswith("#"):

@@ -1,4 +1,4 @@
-"""Camera paths: one camera per frame, all of equal image size."""
+"""Camera paths: one camera per frame, all with the same image size."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from stages.render.pan import pan
 from stages.render.path_file import interpolate_cameras, read_camera_path
 from stages.render.subject import Subject
 
-MAX_ARC = 30.0  # azimuth range of the novel view [degrees]
+MAX_ARC = 30.0  # largest azimuth range of the novel view [degrees]
 MIN_HALF_ARC = 4.0  # half of the smallest azimuth range of the novel view [degrees]
-ARC_FRACTION = 0.3  # half of that range, as a fraction of the range of the photos near it
-NEIGHBOUR_AZIMUTH = 25.0  # the novel view follows the largest group of cameras within this azimuth [degrees]
-ELEVATION_OFFSET = 3.0  # of the novel view above the photos, so that no frame repeats one [degrees]
-MIN_KERNEL_WIDTH = 5.0  # of the average over the photos' elevations and distances [degrees]
-START_AZIMUTH = -60.0  # of an orbit, and the middle of the novel view without photos [degrees]
-DEFAULT_ELEVATION = 25.0  # of an orbit without photos [degrees]
-MAX_ELEVATION = 80.0  # an upright camera cannot look straight down [degrees]
-DEFAULT_FOCAL = 1.2  # without photos [longest side], 45 degrees across
-DEFAULT_ASPECT = 4 / 3  # without photos, width over height
+ARC_FRACTION = 0.3  # half of the azimuth range of the novel view, relative to the range of the photos near it
+NEIGHBOUR_AZIMUTH = 25.0  # the novel view follows the largest group of cameras within this azimuth of one [degrees]
+ELEVATION_OFFSET = 3.0  # elevation of the novel view above the photos, so that no frame repeats a photo [degrees]
+MIN_KERNEL_WIDTH = 5.0  # smallest kernel width for averaging the photos' elevations and distances [degrees]
+START_AZIMUTH = -60.0  # start of an orbit, and middle of the novel view without photos [degrees]
+DEFAULT_ELEVATION = 25.0  # elevation of an orbit without photos [degrees]
+MAX_ELEVATION = 80.0  # largest elevation, as an upright camera cannot look straight down [degrees]
+DEFAULT_FOCAL = 1.2  # focal length without photos; 45 degrees across [longest side]
+DEFAULT_ASPECT = 4 / 3  # aspect ratio without photos, width over height
 FILL = 0.9  # fraction of the width or height of the image that the subject's box occupies
-ZOOM_RANGE = (0.95, 1.6)  # focal length relative to that of the photos
+ZOOM_RANGE = (0.95, 1.6)  # smallest and largest focal length, relative to that of the photos
 
 
 def camera_path(view: str, cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
-    """`frames` cameras for any --view but "all"; `cameras` are those of the photos, if known.
+    """Make `frames` cameras for any --view except "all"; `cameras` are those of the photos, if known.
 
     Raises InputError for a camera or path file that does not exist.
     """
@@ -56,7 +56,7 @@ def novel_path(cameras: Cameras | None, subject: Subject, frames: int, resolutio
         elevation = torch.full_like(azimuth, math.radians(DEFAULT_ELEVATION))
         return _around(None, subject, azimuth, elevation, None, resolution)
     azimuth, elevation, distance = spherical_coordinates(cameras, subject)
-    relative = (azimuth - azimuth[:, None] + math.pi).remainder(2 * math.pi) - math.pi  # of camera j to camera i
+    relative = (azimuth - azimuth[:, None] + math.pi).remainder(2 * math.pi) - math.pi  # [i, j]: from camera i to j
     middle = int((relative.abs() < math.radians(NEIGHBOUR_AZIMUTH)).sum(1).argmax())
     group = relative[middle].abs() < math.radians(NEIGHBOUR_AZIMUTH)
     relative, elevation, distance = relative[middle][group], elevation[group], distance[group]
@@ -96,7 +96,7 @@ def _around(
 ) -> Cameras:  # fmt: skip
     """Cameras that look at the subject, with the focal length at which its box fills the images.
 
-    Without distances they are placed so that the subject's bounding sphere fits.
+    Without `distance` they are placed so that the bounding sphere of the subject fits.
     """
     width, height, focal = _intrinsics(cameras, resolution)
     if distance is None:
@@ -115,7 +115,7 @@ def _around(
 
 
 def _fitting_focal(viewmats: Float[Tensor, "t 4 4"], subject: Subject, width: int, height: int) -> float:
-    """Focal length [px] at which the box occupies the fraction FILL of the image in its largest view."""
+    """Focal length [px] at which the subject's box occupies the fraction FILL of the image in its largest view."""
     corners = subject.corners() @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     depth = corners[..., 2].clamp_min(1e-3 * subject.radius)  # for a camera inside the box
     slopes = (corners[..., :2].abs() / depth[..., None]).amax((0, 1))
@@ -123,7 +123,7 @@ def _fitting_focal(viewmats: Float[Tensor, "t 4 4"], subject: Subject, width: in
 
 
 def _intrinsics(cameras: Cameras | None, resolution: int) -> tuple[int, int, float]:
-    """Width, height and focal length [px]: the photos' most frequent size, scaled to `resolution`."""
+    """Width, height and focal length [px] of the photos' most frequent size, scaled to `resolution`."""
     if cameras is None:
         return resolution // 2 * 2, _even(resolution / DEFAULT_ASPECT), DEFAULT_FOCAL * resolution
     sizes = [tuple(size) for size in cameras.sizes.tolist()]
@@ -134,14 +134,14 @@ def _intrinsics(cameras: Cameras | None, resolution: int) -> tuple[int, int, flo
 
 
 def fixed_camera(cameras: Cameras, index: int, frames: int, resolution: int) -> Cameras:
-    """One stored camera, repeated for all frames."""
+    """Repeat one stored camera for all frames."""
     one = scale_cameras(cameras[[index]], resolution)
     width, height = one.sizes[0].tolist()
     return _with_intrinsics(one.viewmats.expand(frames, 4, 4), one.Ks[0], width, height, one.names[0])
 
 
 def scale_cameras(cameras: Cameras, resolution: int) -> Cameras:
-    """The same views at `resolution` pixels along the longest side; sides are even, as videos require."""
+    """Scale views to `resolution` pixels along the longest side; sides are even, as videos require."""
     Ks, sizes = [], []
     for K, (w, h) in zip(cameras.Ks, cameras.sizes.tolist(), strict=True):
         factor = resolution / max(w, h)
@@ -169,7 +169,7 @@ def find_camera(cameras: Cameras | None, key: str) -> int:
 
 
 def _with_intrinsics(viewmats: Float[Tensor, "t 4 4"], K: Tensor, width: int, height: int, name: str = "") -> Cameras:
-    """Cameras with the same intrinsics in every frame."""
+    """Cameras with the same intrinsics in all frames."""
     t = len(viewmats)
     return Cameras(viewmats.float(), K.expand(t, 3, 3), torch.tensor([[width, height]]).expand(t, 2), (name,) * t)
 

@@ -17,9 +17,9 @@ from stages.core.scene.gaussians import Gaussians
 from stages.render.background import RenderBackground
 
 MIN_DEPTH_OPACITY = 0.5  # accumulated opacity above which a pixel has a depth
-HUE_STEP = 0.6180339887498949  # golden ratio - 1: keeps the hues of any number of objects apart
-MAX_QUANTILE_SAMPLES = 1_000_000  # depths from which the colour range is computed
-DEPTH_QUANTILES = (0.02, 0.98)  # bounds of the colour range
+HUE_STEP = 0.6180339887498949  # golden ratio - 1, which separates the hues of any number of objects
+MAX_QUANTILE_SAMPLES = 1_000_000  # about the most depths from which quantiles are computed
+DEPTH_QUANTILES = (0.02, 0.98)  # quantiles of depth at the ends of the colour range
 DEPTH_COLOURS = ((0.99, 0.93, 0.60), (0.98, 0.62, 0.30), (0.85, 0.27, 0.34), (0.49, 0.14, 0.45), (0.09, 0.07, 0.25))
 
 
@@ -52,7 +52,7 @@ def object_colours(ids: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
 
 
 def colour_by_object(g: Gaussians) -> Gaussians:
-    """The same Gaussians in one flat colour per object; the background in light greys that keep its contrast."""
+    """Recolour Gaussians with one flat colour per object; the background gets light greys that keep its contrast."""
     brightness = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1).mean(1, keepdim=True)
     grey = (0.35 + 0.5 * brightness).expand(-1, 3)
     rgb = torch.where(g.object_id[:, None] > 0, object_colours(g.object_id).to(grey), grey)
@@ -70,7 +70,7 @@ def depth_range(depths: list[Float[Tensor, "h w"]]) -> tuple[float, float]:
 
 
 def colour_depth(depth: Float[Tensor, "h w"], span: tuple[float, float]) -> Float[Tensor, "h w 3"]:
-    """Colour-coded depth: bright is near, dark is far, black is no surface."""
+    """Colour-coded depth: bright is near, dark is far, black is no surface; `span` is the depth range."""
     low, high = span
     colours = torch.tensor(DEPTH_COLOURS).to(depth)
     position = ((depth - low) / (high - low)).clamp(0, 1) * (len(colours) - 1)

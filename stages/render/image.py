@@ -14,14 +14,14 @@ from stages.render.animation import Animation
 from stages.render.overlay import grid_columns
 from stages.render.renderer import Renderer, depth_facts, views_depth_range
 
-SHEET_FRAMES, SHEET_COLUMNS = 12, 4  # of a contact sheet
+SHEET_FRAMES, SHEET_COLUMNS = 12, 4  # frames and columns of a contact sheet
 
 
 def write_image(out: Path, renderer: Renderer) -> dict:
     """Render and write one image; returns the number of views, and the depth range or unit.
 
-    For --view all it shows all cameras at the first frame; of an animation it is a contact sheet of 12 frames. The
-    depth of a single view is written as 16-bit PNG.
+    With --view all it shows all cameras at the first frame; otherwise an animation gives a contact sheet of 12 frames.
+    The depth of a single view is written as 16-bit PNG.
     """
     options, captions = renderer.options, []
     if options.view == "all":
@@ -43,13 +43,13 @@ def write_image(out: Path, renderer: Renderer) -> dict:
 
 
 def _sheet_times(animation: Animation) -> list[float]:
-    """Times of evenly spaced stored frames from first to last [s]."""
+    """Times of evenly spaced stored frames, from first to last [s]."""
     count, last = min(SHEET_FRAMES, len(animation.trajectory)), len(animation.trajectory) - 1
     return [round(i * last / (count - 1)) / animation.fps for i in range(count)]
 
 
 def _write_depth(out: Path, depth: Float[Tensor, "h w"]) -> dict:
-    """16 bits in units of 0.001 scene units, or ten times coarser until the largest depth fits."""
+    """Write depth with 16 bits in units of 0.001 scene units, or coarser by factors of ten until all depths fit."""
     unit = 1e-3
     while float(depth.max()) > 65535 * unit:
         unit *= 10

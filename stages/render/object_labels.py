@@ -1,4 +1,4 @@
-"""Numbers of the objects, drawn at their places in an image, and a legend of numbers and names."""
+"""Labels of objects: numbers drawn at their positions in an image, and a legend of numbers and names."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from stages.core.scene.scene import SceneObject
 from stages.render.draw import object_colours
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-LEGEND_TEXT_SIZE = 0.45  # of FONT
-ROW_HEIGHT, MARGIN = 20, 6  # of the legend [px]
+LEGEND_TEXT_SIZE = 0.45  # scale of FONT in the legend
+ROW_HEIGHT, MARGIN = 20, 6  # height of a row of the legend, and its margin [px]
 
 Image = Float[Tensor, "h w 3"]
 
@@ -33,10 +33,10 @@ def visible_ids(gaussians: Gaussians, cameras: Cameras, index: int) -> Int[Tenso
 
 
 def label_position(mask: np.ndarray) -> tuple[int, int]:
-    """Column and row of the pixel of a mask that is nearest to its centre; thin parts have little weight.
+    """Column and row of the pixel of a mask (h, w), not empty, that is nearest to its weighted centre.
 
-    The mask is (h, w) and not empty. The centre is the mean of its pixels weighted by their squared distance from the
-    border, which changes smoothly when the object moves.
+    The weight of a pixel is its squared distance from the border, so that thin parts count little and the centre moves
+    smoothly with the object.
     """
     border = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     rows, columns = np.nonzero(mask)
@@ -47,7 +47,7 @@ def label_position(mask: np.ndarray) -> tuple[int, int]:
 
 
 def draw_labels(image: Image, ids: Int[Tensor, "h w"], objects: Sequence[SceneObject]) -> Image:
-    """Draw the number of each visible object at its place, with its name where that fits into the object's width."""
+    """Draw the number of each visible object at its position, with its name if that fits into the object's width."""
     pixels = np.ascontiguousarray(to_bytes(image))
     size = max(max(pixels.shape[:2]) / 800, 0.45)
     thickness = max(2, round(1.5 * size))
@@ -63,7 +63,7 @@ def draw_labels(image: Image, ids: Int[Tensor, "h w"], objects: Sequence[SceneOb
 
 
 def _draw_text(pixels: np.ndarray, text: str, centre: tuple[int, int], size: float, thickness: int) -> None:
-    """White text with a black outline, readable on any colour; moved to be inside the image."""
+    """Draw white text with a black outline, which is readable on any colour; it is shifted to be inside the image."""
     (width, height), _ = cv2.getTextSize(text, FONT, size, thickness)
     left = min(max(centre[0] - width // 2, 2), max(pixels.shape[1] - width - 2, 0))
     bottom = min(max(centre[1] + height // 2, height + 2), len(pixels) - 3)
@@ -75,7 +75,7 @@ def _draw_text(pixels: np.ndarray, text: str, centre: tuple[int, int], size: flo
 
 
 def add_legend(image: Image, objects: Sequence[SceneObject]) -> Image:
-    """The image with a legend on its right: colour, number and name of each object, in as many columns as needed."""
+    """Add a legend on the right of an image: colour, number and name of each object, in as many columns as needed."""
     if not objects:
         return image
     rows = max(1, (len(image) - MARGIN) // ROW_HEIGHT)

@@ -12,8 +12,8 @@ from stages.core.scene.formats import suffixes
 
 VIEWS = "novel | orbit | input:K | all | path.json"
 
-# suffix of the output -> "module:function" that writes it; the function takes (path, Renderer) and returns the facts
-# to record next to the file. Images and videos are all those that stages/core/scene/formats.py can write.
+# suffix of the output -> "module:function" (path, Renderer) that writes it and returns the facts to be recorded next to
+# the file. Image and video formats are those that stages/core/scene/formats.py can write.
 OUTPUT_FORMATS = {
     **dict.fromkeys(suffixes("video", writable=True), "stages.render.video:write_video"),
     **dict.fromkeys(suffixes("image", writable=True), "stages.render.image:write_image"),
@@ -73,7 +73,7 @@ class RenderOptions:
 
 
 def hex_colour(text: str) -> tuple[float, float, float]:
-    """#rrggbb as RGB in 0..1; InputError for anything else."""
+    """Parse #rrggbb to RGB in 0..1. Raises InputError for other texts."""
     if not re.fullmatch("#[0-9a-fA-F]{6}", text):
         raise InputError(f"--background {text}: a colour is written #rrggbb, such as #ffffff for white")
     red, green, blue = (int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))

@@ -18,13 +18,13 @@ from stages.render.animation import Animation
 from stages.render.subject import robust_box
 
 ARROW_COLOUR, OUTLINE_COLOUR = (255, 122, 20), (40, 20, 0)  # RGB
-MAX_ARROW_LENGTH = 1.6  # of the arrow of the largest force [radii of its object]
+MAX_ARROW_LENGTH = 1.6  # length of the arrow of the largest force [radius of its object]
 
 Image = Float[Tensor, "h w 3"]
 
 
 def force_arrows(animation: Animation, time: float) -> list[tuple[Tensor, Tensor]]:
-    """Start and end points (world) of the arrow of each force active at a time, scaled by the largest force."""
+    """Start and end points (world) of the arrow of each force that acts at `time` [s], scaled by the largest force."""
     if animation.trajectory is None:
         return []
     time = animation.frame_index(time) * animation.trajectory.info.dt
@@ -35,7 +35,7 @@ def force_arrows(animation: Animation, time: float) -> list[tuple[Tensor, Tensor
 
 
 def _arrow(animation: Animation, time: float, force: dict, largest: float) -> tuple[Tensor, Tensor]:
-    """An arrow that starts at the point of application: the centre of mass, or a point fixed to the object."""
+    """The arrow of a force; it starts at the centre of mass, or at the point of application fixed to the object."""
     trajectory = animation.trajectory
     row = [o.id for o in animation.scene.objects].index(force["object_id"])
     own = trajectory.keypoints.object_id == force["object_id"]
@@ -49,7 +49,7 @@ def _arrow(animation: Animation, time: float, force: dict, largest: float) -> tu
 
 
 def draw_arrows(image: Image, cameras: Cameras, index: int, arrows: list[tuple[Tensor, Tensor]]) -> Image:
-    """Draw arrows (start, end) over the image without occlusion; those behind the camera are omitted."""
+    """Draw arrows (start, end) over the image, without occlusion; arrows behind the camera are omitted."""
     pixels = np.ascontiguousarray(to_bytes(image))
     viewmat, K = cameras.viewmats[index].cpu(), cameras.Ks[index].cpu()
     thickness = max(1, round(max(image.shape[:2]) / 160))
@@ -65,7 +65,7 @@ def draw_arrows(image: Image, cameras: Cameras, index: int, arrows: list[tuple[T
 
 
 def draw_caption(image: Image, text: str, below: bool = False) -> Image:
-    """White text on a dark label in the upper left corner, or in the lower left one."""
+    """Draw white text on a dark label in the upper left corner, or in the lower left corner if `below`."""
     pixels = np.ascontiguousarray(to_bytes(image))
     font, size = cv2.FONT_HERSHEY_SIMPLEX, max(max(image.shape[:2]) / 800, 0.4)
     (width, height), descent = cv2.getTextSize(text, font, size, 1)
@@ -82,7 +82,7 @@ def grid_columns(count: int) -> int:
 
 
 def tile_images(images: list[Float[Tensor, "_ _ 3"]], columns: int) -> Float[Tensor, "h2 w2 3"]:
-    """A grid of images in row order on white; smaller images are centred in their cell."""
+    """Arrange images in a grid, row by row on white; smaller images are centred in their cell."""
     height, width = (max(image.shape[i] for image in images) for i in (0, 1))
     rows = math.ceil(len(images) / columns)
     sheet = torch.ones(rows * height, columns * width, 3)

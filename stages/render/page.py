@@ -18,15 +18,16 @@ from stages.render.background import RenderBackground
 from stages.render.renderer import Clip, Renderer
 from stages.render.subject import find_subject
 
-MAX_KEYPOINTS = 65536  # a page numbers them with 16 bits
-COLOUR_MODES = {"ids": 1, "depth": 2}  # options -> colours of the page at the start
+MAX_KEYPOINTS = 65536  # a page numbers keypoints with 16 bits
+COLOUR_MODES = {"ids": 1, "depth": 2}  # option -> initial colour mode of the page
 
 
 def write_page(out: Path, renderer: Renderer) -> dict:
     """Write the page; returns its size and the numbers of Gaussians and frames.
 
-    Raises InputError for what a page cannot show: several files, all views at once, a photo behind the objects, and
-    trajectories of Gaussians without keypoints; with `playable` for motions of other engines than the learned field.
+    Raises InputError for anything that a page cannot show: several files, all views at once, a photo behind the
+    objects, and trajectories that store every Gaussian; with `playable` for motions of engines other than the learned
+    one.
     """
     options = renderer.options
     _check(out, renderer)
@@ -70,7 +71,7 @@ def _check(out: Path, renderer: Renderer) -> None:
 
 
 def _contents(clip: Clip) -> tuple[Scene, Motion | None]:
-    """The scene with the background that was chosen, and its motion; a frozen frame is a scene at rest."""
+    """The scene with the chosen background, and its motion; a frozen frame is a scene at rest without motion."""
     animation, background = clip.animation, clip.background
     if not animation.is_moving:
         return replace(animation.scene, gaussians=clip.shaded(0.0).to("cpu"), background=background.colour), None
@@ -89,7 +90,7 @@ def _contents(clip: Clip) -> tuple[Scene, Motion | None]:
 
 
 def _kept_rows(scene: Scene, background: RenderBackground) -> torch.Tensor | None:
-    """Rows of the scene's Gaussians that RenderBackground.compose keeps; None for all of them and nothing added."""
+    """Rows of the scene's Gaussians that RenderBackground.compose keeps; None if it changes nothing."""
     ids = scene.gaussians.object_id
     if background.keep_scene:
         return None

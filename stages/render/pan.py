@@ -1,4 +1,4 @@
-"""Camera that pans with moving objects, and where that is not enough zooms out or moves back."""
+"""A camera that pans with moving objects and, if that is not sufficient, zooms out or moves back."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 from stages.core.geometry.cameras import look_at
 from stages.render.subject import Subject
 
-FRAME_FRACTION = 0.95  # of width and height, within which moving objects are kept
-MIN_FOCAL_FACTOR = 0.75  # of the wanted focal length
-MAX_DISTANCE_FACTOR = 1.5  # of the wanted distance; little was photographed beyond the borders of the photos
-DISTANCE_STEP = 1.05  # by which the distance grows until everything fits
-PAN_ITERATIONS = 3  # corrections of the viewing direction
-SMOOTHING = 0.03  # standard deviation of the smoothing of the pan [length of the video]
-MIN_DEPTH_FRACTION = 0.05  # of the largest depth of a frame, as a lower bound of depth in slopes
-MAX_TURN = 1.0  # change of the viewing direction in one correction, as a slope
+FRAME_FRACTION = 0.95  # fraction of the image's width and height in which moving objects are kept
+MIN_FOCAL_FACTOR = 0.75  # smallest focal length, relative to the requested one
+MAX_DISTANCE_FACTOR = 1.5  # largest distance, relative to the requested one; photos show little beyond their borders
+DISTANCE_STEP = 1.05  # factor by which the distance grows until everything fits
+PAN_ITERATIONS = 3  # number of corrections of the viewing direction
+SMOOTHING = 0.03  # standard deviation of the temporal smoothing of the pan [length of the video]
+MIN_DEPTH_FRACTION = 0.05  # lower bound of depth in slopes [largest depth of the frame]
+MAX_TURN = 1.0  # largest change of the viewing direction in one correction, as a slope
 
 
 def pan(
@@ -26,7 +26,7 @@ def pan(
 ) -> tuple[Float[Tensor, "t 4 4"], float]:
     """World-to-camera matrices and focal length [px] of cameras at `offsets` from the subject that look at `aim`.
 
-    They rotate by the minimum that keeps the moving points within images of this `size` at this `focal` length [px].
+    The cameras rotate by the minimum that keeps moving points within images of this `size` at this `focal` length [px].
     """
     points = _at_frames(subject.moving, len(offsets)) if subject.moving is not None else None
     distance_factor = 1.0
@@ -46,7 +46,7 @@ def _turned(
     points: Float[Tensor, "t m 3"] | None, subject: Subject, offsets: Float[Tensor, "t 3"], aim: Float[Tensor, "3"],
     half: Float[Tensor, "2"],
 ) -> Float[Tensor, "t 4 4"]:  # fmt: skip
-    """Each camera rotated until the slopes x / z, y / z of the points are within `half`, or else centred."""
+    """Rotate each camera until the slopes x / z and y / z of its points are within +-`half`, or centred if too wide."""
     eyes, aims = subject.target + offsets, aim.expand_as(offsets)
     viewmats = look_at(eyes, aims)
     if points is None:
@@ -62,7 +62,7 @@ def _turned(
 
 
 def _bounds(points: Float[Tensor, "t m 3"], viewmats: Float[Tensor, "t 4 4"]) -> tuple[Tensor, Tensor]:
-    """Lowest and highest x / z and y / z (t, 2) of the points in each camera."""
+    """Lowest and highest slopes x / z and y / z (t, 2) of the points in each camera."""
     local = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     min_depth = MIN_DEPTH_FRACTION * local[..., 2].abs().amax(1)[:, None, None].clamp_min(1e-9)
     slopes = local[..., :2] / torch.maximum(local[..., 2:], min_depth)
@@ -70,7 +70,7 @@ def _bounds(points: Float[Tensor, "t m 3"], viewmats: Float[Tensor, "t 4 4"]) ->
 
 
 def _at_frames(moving: Float[Tensor, "k m 3"], frames: int) -> Float[Tensor, "t m 3"]:
-    """Moving points interpolated to the frames of the video; a single frame takes the middle of the motion."""
+    """Interpolate moving points to the frames of the video; a single frame is in the middle of the motion."""
     index = torch.linspace(0, len(moving) - 1, frames) if frames > 1 else torch.tensor([(len(moving) - 1) / 2])
     first = index.long().clamp(max=max(len(moving) - 2, 0))
     last = (first + 1).clamp(max=len(moving) - 1)
@@ -78,7 +78,7 @@ def _at_frames(moving: Float[Tensor, "k m 3"], frames: int) -> Float[Tensor, "t 
 
 
 def _smoothed(shifts: Float[Tensor, "t 3"]) -> Float[Tensor, "t 3"]:
-    """Gaussian moving average over the frames, with the first and last value repeated beyond the ends."""
+    """Gaussian moving average over the frames, with edge values repeated beyond the ends."""
     sigma = SMOOTHING * len(shifts)
     radius = math.ceil(3 * sigma)
     weight = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / max(sigma, 1e-6)) ** 2)

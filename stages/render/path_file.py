@@ -22,7 +22,7 @@ EXPECTED = "a camera path (.json: a list of {rotation, position, width, height, 
 
 
 def read_camera_path(path: str | Path) -> Cameras:
-    """The cameras of a path file; InputError unless it is valid and all have the same image size."""
+    """Read the cameras of a path file. Raises InputError unless it is valid and all have the same image size."""
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
@@ -58,7 +58,7 @@ def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
 
 
 def _matrix(row: dict, name: str, height: int, width: int) -> np.ndarray:
-    """Rows of numbers, or all in one list."""
+    """A matrix given as rows of numbers, or as one flat list."""
     values = row[name]
     if isinstance(values, list) and len(values) == height and isinstance(values[0], list):
         return np.array([numbers(line, width, name) for line in values])

@@ -1,4 +1,4 @@
-"""Output format PLY: the Gaussians of one frame, or of every frame in numbered files, which SuperSplat plays."""
+"""Output format PLY: the Gaussians of one frame, or of all frames in numbered files, which SuperSplat plays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def write_ply_frames(out: Path, renderer: Renderer) -> dict:
-    """Write NAME.ply, or of a motion NAME_0000.ply, NAME_0001.ply, ... at the rate of the options, with its shadows.
+    """Write NAME.ply, or for a motion NAME_0000.ply, NAME_0001.ply, ... at the rate of the options, with shadows.
 
     Returns the number of frames, their rate, and the size of all files. Raises InputError for several clips.
     """

@@ -1,4 +1,4 @@
-"""Renderer: one or several animations with their backgrounds and cameras, side by side in every image."""
+"""Renderer of one or several animations with their backgrounds and cameras, side by side in every image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from stages.core.physics.shadow_casting import ShadowCaster
 
 log = logging.getLogger(__name__)
-SAME_CAMERAS = 1e-3  # largest difference of equal cameras: of positions [their extent], of rotation matrix entries
+SAME_CAMERAS = 1e-3  # largest difference between equal cameras: of positions [extent], and of rotation matrix entries
 
 Image = Float[Tensor, "h w 3"]
 Views = list[list[RenderedView]]  # one row per camera, one column per clip
@@ -46,7 +46,7 @@ class Clip:
     name: str = ""  # caption, used if there are several clips
 
     def gaussians(self, time: float) -> Gaussians:
-        """All Gaussians to render at a time [s]."""
+        """All Gaussians to render at `time` [s]."""
         return self._prepared(time) if self.animation.is_moving else self._static
 
     @cached_property
@@ -58,7 +58,7 @@ class Clip:
         return colour_by_object(shown) if self.options.ids else shown
 
     def shaded(self, time: float) -> Gaussians:
-        """The Gaussians at a time [s] with the background that was chosen and the shadows of moved objects."""
+        """The Gaussians at `time` [s], with the chosen background and the shadows of moved objects."""
         g = self.background.compose(self.animation.gaussians(time).to(self.device))
         if self.shadows is None:
             return g
@@ -67,7 +67,7 @@ class Clip:
 
     @cached_property
     def shadows(self) -> ShadowCaster | None:
-        """What casts shadows; None for scenes at rest, other colours than the photos', and with --shadows off."""
+        """The shadow caster; None for scenes at rest, with --ids, --depth or --shadows off, or without keypoints."""
         trajectory, options = self.animation.trajectory, self.options
         if options.shadows == "off" or options.ids or options.depth or trajectory is None or trajectory.dense:
             return None
@@ -82,7 +82,7 @@ class Clip:
         return self.shadows.rest_irradiance(self.background.compose(self.animation.scene.gaussians.to(self.device)))
 
     def render(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
-        """Views of some of the cameras at a time [s]; with the options, object numbers and force arrows."""
+        """Views of the cameras at `indices` at `time` [s]; object numbers and force arrows as the options ask."""
         gaussians = self.gaussians(time)
         views = [render_view(gaussians, cameras, i, self.background) for i in indices]
         if self.options.ids:
@@ -99,7 +99,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Renderer:
-    """Renders its clips side by side in one image; the input of the writers of the output formats."""
+    """Renders its clips side by side in one image; passed to the writers of output formats."""
 
     clips: Sequence[Clip]
     options: RenderOptions
@@ -116,20 +116,20 @@ class Renderer:
 
     @property
     def fps(self) -> float:
-        """Frames per second: those of the options, or else the highest rate of the moving clips."""
+        """Frames per second: from the options, else the highest rate of the moving clips."""
         moving = [clip.animation.fps for clip in self.clips if clip.animation.is_moving]
         return float(self.options.fps or max(moving, default=self.longest.fps))
 
     def light_facts(self) -> dict:
-        """The light that shadows were drawn by, as recorded next to the output."""
+        """The light that casts the shadows, as recorded next to the output."""
         lights = [asdict(clip.shadows.light) for clip in self.clips if clip.shadows is not None]
         return {"light": lights if len(lights) > 1 else lights[0]} if lights else {}
 
     def cameras(self, frames: int, resolution: int) -> list[Cameras]:
-        """For each clip one camera per frame, or for --view all every stored camera.
+        """For each clip one camera per frame or, with --view all, every stored camera.
 
-        Clips whose stored cameras agree use one common path, which frames all of them. Raises InputError where --view
-        needs stored cameras and there are none, or not equally many in all files.
+        Clips whose stored cameras agree share a path that frames all of them. Raises InputError if --view needs stored
+        cameras and there are none, or if --view all finds different numbers of them.
         """
         animations = [clip.animation for clip in self.clips]
         stored = [animation.scene.cameras for animation in animations]
@@ -151,16 +151,17 @@ class Renderer:
         return scale_cameras(stored, max(16, 2 * resolution // grid_columns(len(stored))))
 
     def render(self, time: float, cameras: list[Cameras], indices: list[int]) -> Views:
-        """Views of some of the cameras at a time [s]: for each camera, one view per clip."""
+        """Views of the cameras at `indices` at `time` [s]: for each camera, one view per clip."""
         columns = [clip.render(time, c, indices) for clip, c in zip(self.clips, cameras, strict=True)]
         return [list(row) for row in zip(*columns, strict=True)]
 
     def compose(
         self, views: Views, span: tuple[float, float] | None, columns: int = 1, captions: Sequence[str] = ()
     ) -> Image:
-        """One image of all views, in a grid of `columns`: colour, or depth in the range `span`; with captions if given.
+        """Compose all views to one image, a grid of `columns`: colour, or depth in the range `span`.
 
-        The views of each camera are side by side in one cell of the grid. With --ids a legend is on the right.
+        The views of a camera are side by side in one cell, under its caption if there is one. With --ids a legend is
+        added on the right.
         """
         images = [self._side_by_side(row, span) for row in views]
         if captions:
@@ -170,7 +171,7 @@ class Renderer:
 
     @cached_property
     def _objects(self) -> list[SceneObject]:
-        """Objects of all clips by number; those of equal number and name once."""
+        """Objects of all clips, sorted by number; objects of the same number and name appear once."""
         named = {(o.id, o.name): o for clip in self.clips for o in clip.animation.scene.objects}
         return [named[key] for key in sorted(named)]
 
@@ -193,7 +194,7 @@ def depth_facts(span: tuple[float, float] | None) -> dict:
 
 
 def _same_cameras(a: Cameras, b: Cameras) -> bool:
-    """Whether two files have the same cameras, and so the same world frame."""
+    """Whether two files have the same cameras, and therefore the same world frame."""
     if a.viewmats.shape != b.viewmats.shape:
         return False
     p, q = centres(a.viewmats), centres(b.viewmats)

@@ -1,6 +1,6 @@
 """Output formats of other tools: GLB (KHR_gaussian_splatting) with animated objects, and SPZ (version 3).
 
-Both have y up, as glTF has: the world is turned by -90 degrees about x.
+Both have y up, as in glTF, so the world is rotated by -90 degrees about x.
 Sources: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting; github.com/nianticlabs/spz.
 """
 
@@ -29,9 +29,9 @@ from stages.core.scene.trajectory import Trajectory
 from stages.render.renderer import Clip, Renderer
 
 log = logging.getLogger(__name__)
-Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of world coordinates
-MAX_RIGID_ERROR = 0.02  # of keypoints moved as one rigid body [radii of their object]
-LARGE = 100e6  # size of a file above which a message says so [bytes]
+Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation of world coordinates to y up
+MAX_RIGID_ERROR = 0.02  # largest error of keypoints that move as a rigid body [radius of their object]
+LARGE = 100e6  # file size above which there is a warning [bytes]
 GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 FLOAT, POINTS, STEP = 5126, 0, "STEP"
 PREFIX = "KHR_gaussian_splatting"
@@ -40,7 +40,7 @@ MAX_SPZ_POSITION = 2**23 / 2**FRACTION_BITS  # [scene units]
 
 
 def write_spz(out: Path, renderer: Renderer) -> dict:
-    """Write one frame as SPZ. Raises InputError for a motion, and for scenes that its 24-bit positions cannot hold."""
+    """Write one frame as SPZ. Raises InputError for a motion, and for scenes too large for its 24-bit positions."""
     clip = only_clip(out, renderer)
     if clip.animation.is_moving:
         raise InputError(f"{out}: SPZ holds one frame; choose it with --frame, or write a .glb or .html")
@@ -63,13 +63,13 @@ def _spz(g: Gaussians) -> bytes:
     parts = [part.clamp(0, 255).to(torch.uint8).numpy().tobytes() for part in parts]
     header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(g), degree, FRACTION_BITS, 0, 0)
     rest = g.sh[:, 1:].flatten(1)
-    step = torch.where(torch.arange(rest.shape[1]) < 9, 2.0**3, 2.0**4)  # 5 bits for degree 1, 4 above: compress well
+    step = torch.where(torch.arange(rest.shape[1]) < 9, 2.0**3, 2.0**4)  # 5 bits for degree 1, 4 above, for compression
     harmonics = ((rest * 128 / step).round() * step + 128).clamp(0, 255)
     return b"".join([header, *parts, _smallest_three(g.quats), harmonics.to(torch.uint8).numpy().tobytes()])
 
 
 def _smallest_three(quats: Float[Tensor, "n 4"]) -> bytes:
-    """Quaternions in 32 bits: number of the largest of x y z w, then sign and 9 bits of each of the others."""
+    """Quaternions in 32 bits: index of the largest of x y z w, then sign and 9 bits of each other component."""
     q = torch.nn.functional.normalize(quats[:, [1, 2, 3, 0]], dim=1)
     largest = q.abs().argmax(1)
     q = q * torch.where(q.gather(1, largest[:, None]) < 0, -1.0, 1.0)
@@ -84,8 +84,8 @@ def _smallest_three(quats: Float[Tensor, "n 4"]) -> bytes:
 def write_glb(out: Path, renderer: Renderer) -> dict:
     """Write the scene as GLB: a node for the background and one for each object, moved by an animation.
 
-    Objects that deform have a node for each frame, of which one is shown at a time. Raises InputError for trajectories
-    that store every Gaussian.
+    Objects that deform have a node for each frame, and only one of these is shown at a time. Raises InputError for
+    trajectories that store every Gaussian.
     """
     clip = only_clip(out, renderer)
     animation, trajectory = clip.animation, clip.animation.trajectory
@@ -118,7 +118,7 @@ def write_glb(out: Path, renderer: Renderer) -> dict:
 
 
 def only_clip(out: Path, renderer: Renderer) -> Clip:
-    """The clip of a file that holds one scene; InputError for options that such a file cannot follow."""
+    """The clip for a format that contains one scene. Raises InputError for options that the format does not support."""
     options = renderer.options
     if len(renderer.clips) > 1 or options.view == "all" or options.depth:
         raise InputError(f"{out}: holds one scene; omit --side-by-side, --view all and --depth")
@@ -132,7 +132,7 @@ def _y_up(g: Gaussians) -> Gaussians:
 
 
 def rigid_motion(t: Trajectory, o: SceneObject) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Centre at rest (3,), rotations (t, 3, 3) and centres (t, 3) of an object's keypoints; None where it deforms."""
+    """Centre at rest (3,), rotations (t, 3, 3) and centres (t, 3) of an object's keypoints; None if it deforms."""
     own = t.keypoints.object_id == o.id
     rest, positions = t.keypoints.rest[own], t.positions[:, own]
     if not len(rest):
@@ -146,19 +146,19 @@ def rigid_motion(t: Trajectory, o: SceneObject) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _add_rigid(glb: _Glb, o: SceneObject, g: Gaussians, pose: tuple[Tensor, Tensor, Tensor], dt: float) -> None:
-    """A node with the Gaussians around their centre, and its translations and rotations."""
+    """Add a node with the Gaussians relative to their centre, animated by translations and rotations."""
     centre, rotations, centres = pose
     node = glb.add_node(o.name, _y_up(transformed(g, Similarity(1.0, torch.eye(3), -centre))), Y_UP @ centre)
     times = dt * torch.arange(len(centres))
     turns = quaternion(Y_UP @ rotations @ Y_UP.T)
-    flips = torch.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)  # the short way between frames
+    flips = torch.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)  # take the shorter arc
     turns = turns * torch.cat([torch.ones(1), flips])[:, None]
     glb.animate(node, "translation", times, centres @ Y_UP.T)
     glb.animate(node, "rotation", times, turns[:, [1, 2, 3, 0]])
 
 
 def _add_frames(glb: _Glb, clip: Clip, scene: Scene, o: SceneObject) -> None:
-    """A node for each frame; all but one have scale 0 at any time."""
+    """Add a node for each frame; at any time all but one have scale 0."""
     dt, count = clip.animation.trajectory.info.dt, len(clip.animation.trajectory)
     for frame in range(count):
         moved = clip.animation.gaussians(frame * dt).to("cpu")
@@ -179,7 +179,7 @@ class _Glb:
         }  # fmt: skip
 
     def accessor(self, values: Tensor, bounds: bool = False) -> int:
-        """The number of an accessor of float32 rows."""
+        """Add float32 rows to the buffer; returns the index of their accessor."""
         rows = values.detach().float().contiguous().numpy()
         kind = "SCALAR" if rows.ndim == 1 else f"VEC{rows.shape[1]}"
         view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": rows.nbytes}
@@ -193,7 +193,7 @@ class _Glb:
         return len(self.json["accessors"]) - 1
 
     def add_node(self, name: str, g: Gaussians, translation: Tensor | None = None) -> int:
-        """The number of a node with a mesh of these Gaussians."""
+        """Add a node with a mesh of these Gaussians; returns its index."""
         attributes = {
             "POSITION": self.accessor(g.means, bounds=True),
             "COLOR_0": self.accessor(torch.cat([(g.sh[:, 0] * C0 + 0.5).clamp(0, 1), g.opacities[:, None]], 1)),
@@ -215,7 +215,7 @@ class _Glb:
         return len(self.json["nodes"]) - 1
 
     def animate(self, node: int, path: str, times: Tensor, values: Tensor, interpolation: str = "LINEAR") -> None:
-        """A channel of the file's animation."""
+        """Add a channel to the animation of the file."""
         if not self.json["animations"]:
             self.json["animations"].append({"name": "motion", "channels": [], "samplers": []})
         animation = self.json["animations"][0]
@@ -225,7 +225,7 @@ class _Glb:
         animation["samplers"].append(sampler)
 
     def write(self, out: Path) -> None:
-        """Write the file; its chunks are padded to 4 bytes."""
+        """Write the file; chunks are padded to 4 bytes."""
         document = {k: v for k, v in self.json.items() if v != []}
         document["buffers"] = [{"byteLength": len(self.buffer)}]
         text = json.dumps(document, allow_nan=False).encode()

@@ -1,4 +1,4 @@
-"""Stage render: traj.h5 or scene.ply -> video or image."""
+"""The render stage: traj.h5 or scene.ply -> video or image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stages.render.background import open_background
 from stages.render.options import OUTPUT_FORMATS, RenderOptions
 from stages.render.renderer import Clip, Renderer
 
-MAX_FILES = 8  # side by side
+MAX_FILES = 8  # most files that are rendered side by side
 
 
 def run(
@@ -24,9 +24,9 @@ def run(
 ) -> Path:
     """Render a trajectory or a scene, or several side by side, and print the path of the output.
 
-    The suffix of `out` selects the format: a video, or an image, which for a trajectory is a contact sheet of 12
-    frames; a folder gets numbered PLY files. Without `out` the name is derived from source and view. OUT.json records
-    inputs, options and what was rendered. Raises InputError for unusable inputs and options.
+    The suffix of `out` selects the format, for example a video, or an image, which for a trajectory is a contact sheet
+    of 12 frames; a folder gets numbered PLY files. Without `out` the name is derived from source and view. OUT.json
+    records inputs, options and facts about the output. Raises InputError for unusable inputs and options.
     """
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(s) for s in source]
     _check_count(sources, options)
@@ -66,7 +66,7 @@ def _writer(out: Path):
 
 
 def _check_count(sources: list[Path], options: RenderOptions) -> None:
-    """One file, or several with --side-by-side."""
+    """Raise InputError unless there is one file, or with --side-by-side several."""
     if len(sources) > 1 and not options.side_by_side:
         raise InputError(f"{len(sources)} files: add --side-by-side to render them together, or give one at a time")
     if len(sources) == 1 and options.side_by_side:
@@ -76,16 +76,16 @@ def _check_count(sources: list[Path], options: RenderOptions) -> None:
 
 
 def _captions(sources: list[Path]) -> list[str]:
-    """File names, preceded by as many of their folders as make them different."""
+    """File names, preceded by as many parent folders as are needed to distinguish them."""
     for depth in range(1, max(len(s.parts) for s in sources) + 1):
         names = ["/".join(s.with_suffix("").parts[-depth:]) for s in sources]
         if len(set(names)) == len(names):
             return names
-    return [f"{s.stem} {i}" for i, s in enumerate(sources, start=1)]  # the same file, more than once
+    return [f"{s.stem} {i}" for i, s in enumerate(sources, start=1)]  # a file is given more than once
 
 
 def _default_output(sources: list[Path], renderer: Renderer) -> Path:
-    """traj.h5 -> traj_novel.mp4, a.h5 b.h5 -> a_b_novel.mp4; PNG if neither scene nor camera moves."""
+    """Default output name: traj.h5 -> traj_novel.mp4, a.h5 b.h5 -> a_b_novel.mp4; PNG if scene and camera are still."""
     options = renderer.options
     still = not renderer.is_moving and (options.view == "all" or options.view.startswith("input:"))
     stem = "_".join(s.stem for s in sources)

@@ -14,15 +14,15 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.render.animation import Animation
 
-EXTENT_QUANTILES = (0.05, 0.95)  # of each coordinate, the extent of a set of points
-# The radius of the cameras' focus is a third of their distance from it; these three are multiples of that radius.
-MAX_OBJECT_DISTANCE = 2.0  # objects farther from the focus are scenery
-MAX_POINT_DISTANCE = 4.0  # moving points farther from the focus have left the scene
-MAX_AIM_SHIFT = 0.35  # of the aim from the focus towards the objects
-MIN_OBJECT_FRACTION = 0.05  # of the Gaussians of the largest object; smaller objects are ignored
-MAX_POINTS = 200_000  # to which point sets are thinned
-MAX_TIMES, MAX_TRACKED_POINTS = 60, 3000  # to which the moving points are thinned
-MIN_MOTION = 0.1  # of the subject's radius; points that move less are not tracked
+EXTENT_QUANTILES = (0.05, 0.95)  # quantiles of each coordinate that bound a set of points
+# The focus radius is a third of the distance of the cameras from their focus.
+MAX_OBJECT_DISTANCE = 2.0  # distance from the focus beyond which objects are scenery [focus radius]
+MAX_POINT_DISTANCE = 4.0  # distance from the focus beyond which moving points have left the scene [focus radius]
+MAX_AIM_SHIFT = 0.35  # largest shift of the aim from the focus towards the objects [focus radius]
+MIN_OBJECT_FRACTION = 0.05  # number of Gaussians below which objects are ignored, relative to the largest object
+MAX_POINTS = 200_000  # number of points to which point sets are thinned
+MAX_TIMES, MAX_TRACKED_POINTS = 60, 3000  # numbers of times and points to which moving points are thinned
+MIN_MOTION = 0.1  # displacement below which points are not tracked [radius of the subject]
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Subject:
     """An axis-aligned box to be framed."""
 
     centre: Float[Tensor, "3"]
-    half: Float[Tensor, "3"]  # from the centre to the faces
-    aim: Float[Tensor, "3"] | None = None  # where to look, if not at the centre
+    half: Float[Tensor, "3"]  # distances from the centre to the faces
+    aim: Float[Tensor, "3"] | None = None  # point to look at; None: the centre
     moving: Float[Tensor, "t m 3"] | None = None  # tracked points at evenly spaced times of the animation
 
     @property
@@ -51,9 +51,9 @@ class Subject:
 
 
 def find_subject(animation: Animation) -> Subject:
-    """The objects over all of their motion; without objects the cameras' focus; without cameras the whole scene.
+    """Find the subject: the objects over their whole motion; without objects the focus, or else the whole scene.
 
-    With photos the camera aims at their focus, shifted by at most MAX_AIM_SHIFT towards the objects.
+    With photos the camera aims at the focus, shifted by at most MAX_AIM_SHIFT towards the objects.
     """
     g, cameras = animation.scene.gaussians, animation.scene.cameras
     opaque = g[g.opacities > SURFACE_OPACITY] if (g.opacities > SURFACE_OPACITY).any() else g
@@ -70,7 +70,7 @@ def find_subject(animation: Animation) -> Subject:
 
 
 def _within_scene(moving: Float[Tensor, "t m 3"] | None, focus: Subject) -> Float[Tensor, "t m 3"] | None:
-    """Tracked points, with those that have left the scene moved to the focus so that they do not attract the camera."""
+    """Move tracked points that have left the scene to the focus, so that they do not attract the camera."""
     if moving is None:
         return None
     outside = (moving - focus.centre).norm(dim=2, keepdim=True) > MAX_POINT_DISTANCE * focus.radius
@@ -91,7 +91,7 @@ def merge_subjects(subjects: Sequence[Subject]) -> Subject:
 
 
 def _objects_box(animation: Animation, opaque: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
-    """Box of these objects over the animation, which always includes their initial positions."""
+    """The box of these objects over the whole animation; it always includes their initial positions."""
     trajectory = animation.trajectory
     if trajectory is not None:
         selected = torch.isin(trajectory.keypoints.object_id, ids)
@@ -104,7 +104,7 @@ def _objects_box(animation: Animation, opaque: Gaussians, ids: Int[Tensor, "o"])
 
 
 def _moving_points(positions: Float[Tensor, "t p 3"], min_motion: float) -> Float[Tensor, "t m 3"] | None:
-    """The points that move by more than `min_motion`, thinned in time and number."""
+    """The points that move by more than `min_motion`, thinned in time and number; None if there are none."""
     positions = positions[_evenly(len(positions), min(len(positions), MAX_TIMES))]
     positions = positions[:, (positions - positions[0]).norm(dim=2).amax(0) > min_motion]
     count = positions.shape[1]
@@ -117,7 +117,7 @@ def _evenly(length: int, count: int) -> Int[Tensor, "c"]:
 
 
 def _central_objects(g: Gaussians, focus: Subject | None) -> Int[Tensor, "o"]:
-    """Ids of the objects that are not very small and are near the cameras' focus; of all, if none is near."""
+    """Ids of the objects that are not very small and are near the focus; if none is near, of all that are not small."""
     ids, counts = g.object_id[g.object_id > 0].unique(return_counts=True)
     ids = ids[counts >= MIN_OBJECT_FRACTION * counts.max()] if len(ids) else ids
     if focus is None or not len(ids):
@@ -128,7 +128,7 @@ def _central_objects(g: Gaussians, focus: Subject | None) -> Int[Tensor, "o"]:
 
 
 def robust_box(points: Float[Tensor, "n 3"]) -> Subject:
-    """The box between EXTENT_QUANTILES of each coordinate, enlarged to compensate for the quantiles."""
+    """The box between EXTENT_QUANTILES of each coordinate, enlarged by as much as the quantiles cut off."""
     thinned = points[:: max(1, len(points) // MAX_POINTS)].double()
     low, high = torch.quantile(thinned, torch.tensor(EXTENT_QUANTILES, dtype=torch.float64), dim=0)
     half = (high - low) / 2 / (EXTENT_QUANTILES[1] - EXTENT_QUANTILES[0])
@@ -136,9 +136,9 @@ def robust_box(points: Float[Tensor, "n 3"]) -> Subject:
 
 
 def axes_focus(cameras: Cameras) -> Subject | None:
-    """The point nearest to all viewing axes (least squares).
+    """The focus of cameras: the point nearest to all viewing axes (least squares).
 
-    None when the axes are nearly parallel, or when the point is behind half of the cameras or more.
+    None if the axes are nearly parallel, or if the point is behind more than half of the cameras.
     """
     eyes = centres(cameras.viewmats).double()
     axes = cameras.viewmats[:, 2, :3].double()
@@ -154,7 +154,10 @@ def axes_focus(cameras: Cameras) -> Subject | None:
 
 
 def common_view_centre(cameras: Cameras, points: Float[Tensor, "n 3"]) -> Subject | None:
-    """The median of the points in the central quarter of at least half of the photos, for nearly parallel cameras."""
+    """The focus of nearly parallel cameras: median of the points that are central in half of the photos or more.
+
+    A point is central in a photo if it is in the middle half of its width and height. None if there is no such point.
+    """
     points = points[:: max(1, len(points) // MAX_POINTS)]
     count = torch.zeros(len(points))
     for viewmat, K, size in zip(cameras.viewmats, cameras.Ks, cameras.sizes, strict=True):
@@ -168,5 +171,5 @@ def common_view_centre(cameras: Cameras, points: Float[Tensor, "n 3"]) -> Subjec
 
 
 def _focus_cube(point: Float[Tensor, "3"], distance: Float[Tensor, ""]) -> Subject:
-    """A cube whose corners are a third as far from its centre as the cameras."""
+    """A cube whose corners are a third as far from its centre as the cameras are."""
     return Subject(point, (distance / 3 / 3**0.5).expand(3))

@@ -1,7 +1,7 @@
 """Output format USD: a UsdVol.ParticleField3DGaussianSplat for the background and for each object, with time samples.
 
-Objects that move as rigid bodies have a transform per frame, others their Gaussians per frame. The file has z up and
-the scene's length of a unit. Source: the schema usdVol of OpenUSD 26.03.
+Objects that move as rigid bodies have a transform for each frame, others have their Gaussians for each frame. The file
+has z up and the unit of length of the scene. Source: the schema usdVol of OpenUSD 26.03.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from stages.render.splat_files import only_clip, rigid_motion
 
 
 def write_usd(out: Path, renderer: Renderer) -> dict:
-    """Write the scene and its motion. Raises MissingPackage without usd-core, and InputError as for a GLB."""
+    """Write the scene and its motion. Raises MissingPackage without usd-core, and InputError as `write_glb`."""
     try:
         from pxr import Gf, Usd, UsdGeom, UsdVol  # only this format needs it
 
-        UsdVol.ParticleField3DGaussianSplat  # noqa: B018 -- the schema is younger than the package
+        UsdVol.ParticleField3DGaussianSplat  # noqa: B018 -- older versions of the package lack this schema
     except (ImportError, AttributeError) as error:
         raise MissingPackage(f"{out}: needs usd-core 26.3 or later; `pip install -U 'ngff[usd]'`") from error
     clip = only_clip(out, renderer)
@@ -72,7 +72,7 @@ def write_usd(out: Path, renderer: Renderer) -> dict:
 
 
 def _fill(field, g: Gaussians, frame: int | None = None) -> None:
-    """Set the attributes of a field of Gaussians, or the time samples of those that change with the frame."""
+    """Set all attributes of a field of Gaussians, or the time samples at `frame` of attributes that change."""
     from pxr import Vt
 
     prim, time = field.GetPrim(), [] if frame is None else [frame]
@@ -93,7 +93,7 @@ def _fill(field, g: Gaussians, frame: int | None = None) -> None:
 
 
 def _matrices(centre: Tensor, rotations: Tensor, centres: Tensor) -> Tensor:
-    """Transforms (t, 4, 4) of points at rest: R (x - centre) + centre of the frame."""
+    """Transforms (t, 4, 4) from rest to each frame: R (x - centre) + centre in that frame."""
     out = torch.eye(4).repeat(len(rotations), 1, 1)
     out[:, :3, :3] = rotations
     out[:, :3, 3] = centres - (rotations @ centre[:, None])[..., 0]

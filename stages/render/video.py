@@ -12,9 +12,9 @@ from stages.render.renderer import Renderer, Views, depth_facts, views_depth_ran
 
 
 def write_video(out: Path, renderer: Renderer) -> dict:
-    """Render and write all frames; returns number and rate of frames, and the depth range.
+    """Render and write all frames; returns their number and rate, and the depth range.
 
-    Colour-coded depth has one range for the whole video, taken from its first, middle and last frame.
+    Colour-coded depth has one range for the whole video, from its first, middle and last frame.
     """
     fps = renderer.fps
     times = renderer.longest.frame_times(fps)

@@ -1,1 +1,1 @@
-"""Stage evaluate: prediction and ground truth -> metrics."""
+"""Evaluation: prediction and ground truth -> metrics."""

@@ -15,9 +15,9 @@ from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.scene import SceneObject
 
-# Median distance of corresponding items above which two files have different reference frames:
-MAX_CAMERA_DISTANCE = 0.1  # of cameras [RMS distance of the cameras from their mean]
-MAX_OBJECT_DISTANCE = 2.0  # of object centres, without shared cameras [RMS radius of the objects]
+# Two files have different reference frames if the median distance between corresponding items is larger.
+MAX_CAMERA_DISTANCE = 0.1  # between cameras [RMS distance of the cameras from their mean]
+MAX_OBJECT_DISTANCE = 2.0  # between object centres, if no cameras are shared [RMS radius of the objects]
 
 Pairs = list[tuple[SceneObject, SceneObject]]  # predicted, true
 
@@ -36,15 +36,15 @@ class ReferenceFrame:
         return self.points[object.id].mean(0)
 
     def transformed(self, similarity: Similarity) -> ReferenceFrame:
-        """The same after a similarity transform."""
+        """Apply a similarity transform."""
         cameras = None if self.cameras is None else self.cameras.transformed(similarity)
         return replace(self, cameras=cameras, points={i: similarity(p) for i, p in self.points.items()})
 
 
 def find_alignment(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[Similarity, str]:
-    """The similarity from the frame of the prediction to that of the truth, and a sentence on how it was found.
+    """Find the similarity from the frame of the prediction to that of the truth; also returns a sentence on the method.
 
-    Uses two or more cameras with the same names, or else the centres of two or more objects with the same names.
+    Uses two or more cameras with the same names, or otherwise the centres of two or more objects with the same names.
     Raises InputError if there are neither.
     """
     predicted, true = _shared_cameras(prediction, truth)
@@ -64,7 +64,7 @@ def find_alignment(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[S
 
 
 def check_same_reference_frame(prediction: ReferenceFrame, truth: ReferenceFrame, pairs: Pairs) -> None:
-    """InputError if shared cameras, or without any matched objects, are far apart."""
+    """Raise InputError if shared cameras or, without shared cameras, matched objects are far apart."""
     predicted, true = _shared_cameras(prediction, truth)
     if predicted is not None and len(predicted) >= 2:
         a, b = centres(predicted.viewmats), centres(true.viewmats)
@@ -85,7 +85,7 @@ def check_same_reference_frame(prediction: ReferenceFrame, truth: ReferenceFrame
 
 
 def _shared_cameras(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[Cameras, Cameras] | tuple[None, None]:
-    """Cameras of both with equal photo names (without suffix), in the same order."""
+    """Cameras of both files with equal photo names (without suffix), in the same order; (None, None) without any."""
     if prediction.cameras is None or truth.cameras is None:
         return None, None
     predicted, true = (
@@ -103,9 +103,9 @@ def _rms_radius(points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
 
 
 def _from_cameras(predicted: Cameras, true: Cameras) -> Similarity:
-    """Least-squares similarity of the camera centres and the end points of the camera axes.
+    """Least-squares similarity between the camera centres and the end points of the camera axes.
 
-    The axes have the length of the RMS radius of the centres. They determine the rotation about a straight path of
+    The length of the axes is the RMS radius of the centres. The axes determine the rotation about a straight path of
     cameras, which the centres alone do not.
     """
     points = []
@@ -133,5 +133,5 @@ def _upright(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Simi
 
 
 def _single(s: Similarity) -> Similarity:
-    """In single precision."""
+    """Convert to single precision."""
     return Similarity(s.scale, s.rotation.float(), s.translation.float())

@@ -11,9 +11,9 @@ The metrics of the NGFF paper (ICLR 2026), whose text does not define them compl
 Pooling all displacements of a scene into one correlation instead (`pooled_correlation`) mostly measures that all
 objects fall, and is close to 1 for any model.
 
-Every function takes leading batch dimensions, which remain in the result, and an optional `mask` of valid points (false
-for padding, where objects differ in their number of points). With `seen`, frames in which the truth has lost an object
-do not count for it. A mean over nothing is nan.
+Every function accepts leading batch dimensions, which remain in the result, and an optional `mask` of valid points
+(false for padding, if objects have different numbers of points). With `seen`, frames in which the truth has lost an
+object do not count for this object. A mean over nothing is nan.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ def mse(predicted: Points, truth: Points, mask: Mask | None = None, seen: Seen |
 
 
 def rmse(predicted: Points, truth: Points, mask: Mask | None = None, seen: Seen | None = None) -> Float[Tensor, "*b"]:
-    """Root mean squared error per coordinate, of each scene [units]."""
+    """Root mean squared error per coordinate of each scene [units]."""
     return mse(predicted, truth, mask, seen).sqrt()
 
 
 def pce(predicted: Points, truth: Points, mask: Mask | None = None, seen: Seen | None = None) -> Float[Tensor, "*b"]:
-    """Mean norm of the difference of predicted and true displacement per frame [units/frame]; nan for one frame."""
+    """Mean norm of the difference between predicted and true step per frame [units/frame]; nan for one frame."""
     error, valid = (predicted - truth).diff(dim=-4).norm(dim=-1), _valid(truth, mask, seen)
     return _mean(error, None if valid is None else valid[..., 1:, :, :] & valid[..., :-1, :, :], 3)
 
 
 def fpe(predicted: Points, truth: Points, mask: Mask | None = None, seen: Seen | None = None) -> Float[Tensor, "*b"]:
-    """Mean distance of predicted and true points in the last frame, in which each object is seen [units]."""
+    """Mean distance between predicted and true points in the last frame in which each object is seen [units]."""
     distance = (predicted - truth).norm(dim=-1)
     if seen is None:
         return _mean(distance[..., -1, :, :], mask, 2)
@@ -93,7 +93,7 @@ def pooled_correlation(
 
 
 def error_over_time(predicted: Points, truth: Points, mask: Mask | None = None) -> Float[Tensor, "*b t o"]:
-    """Mean distance of predicted and true points of each object in each frame [units]."""
+    """Mean distance between predicted and true points of each object in each frame [units]."""
     distance = (predicted - truth).norm(dim=-1)
     return _mean(distance, None if mask is None else mask[..., None, :, :].expand_as(distance), 1)
 
@@ -102,7 +102,7 @@ def all_metrics(
     predicted: Points, truth: Points, mask: Mask | None = None, min_motion: float = MIN_MOTION,
     seen: Seen | None = None,
 ) -> dict[str, Float[Tensor, "*b"]]:  # fmt: skip
-    """Every metric, by its name in tables; the output of `evaluate` has one column for each."""
+    """All metrics by their names in tables; the output of `evaluate` has one column for each."""
     return {
         "MSE": mse(predicted, truth, mask, seen),
         "RMSE": rmse(predicted, truth, mask, seen),
@@ -114,7 +114,7 @@ def all_metrics(
 
 
 def _valid(truth: Points, mask: Mask | None, seen: Seen | None) -> Bool[Tensor, "*b t o p"] | None:
-    """The points that count in each frame; None: all."""
+    """Mask of the points that count in each frame; None: all."""
     if mask is None and seen is None:
         return None
     valid = torch.ones_like(truth[..., 0], dtype=torch.bool)

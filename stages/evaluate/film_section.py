@@ -1,4 +1,4 @@
-"""The part of a report that shows a trajectory: the player, its objects, times of the stages, and what to try next."""
+"""The section of a report on a trajectory: player, objects, times of the stages, and commands to try next."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from stages.core.scene.scene import SceneObject
 from stages.core.scene.schema import texts
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 
-PARTICLES = 6000  # from which masses are estimated
+PARTICLES = 6000  # number of particles from which volumes are estimated
 STYLE = "iframe { width: 100%; height: 480px; border: 1px solid #ddd; border-radius: 8px } pre { overflow: auto }"
-# The curves' cursor follows the player's time, and a click on the curves sets it.
+# The cursor of the curves follows the player's time, and a click on the curves sets this time.
 SCRIPT = """
 const frame = document.querySelector("iframe"), plot = document.querySelector("svg");
 const cursor = document.getElementById("cursor");
@@ -58,14 +58,14 @@ def _player(trajectory: Trajectory, title: str) -> str:
     shadows = find_shadows(trajectory.scene, trajectory.keypoints)
     motion = Motion.of(trajectory)
     if trajectory.field is not None:
-        with suppress(InputError):  # of other weights, say: the film alone is shown
+        with suppress(InputError):  # for example other weights: then only the film is shown
             motion = replace(motion, field=playable_parts(trajectory))
     page = film_page(pack_film(trajectory.scene, motion, {"arrows": True}, shadows), title)
     return f'<iframe title="{escape(title)}" srcdoc="{escape(page)}"></iframe>'
 
 
 def _objects(trajectory: Trajectory) -> str:
-    """A table of the objects: size, mass and material, and where the material is from."""
+    """Table of the objects: size, mass, material, and the source of the material."""
     scene, choices = trajectory.scene, _materials(trajectory)
     given = {text.partition("=")[0] for text in _given_materials(trajectory)}
     unit = "m" if scene.has_known_scale else "units"
@@ -83,14 +83,14 @@ def _objects(trajectory: Trajectory) -> str:
 
 
 def _masses(trajectory: Trajectory) -> list[float]:
-    """Mass of each object [kg], nan where its volume is not known."""
+    """Mass of each object [kg]; nan if its volume is unknown."""
     choices = _materials(trajectory)
     return [choices[o.id].material.density * volume
             for o, volume in zip(trajectory.scene.objects, _volumes(trajectory), strict=True)]  # fmt: skip
 
 
 def _volumes(trajectory: Trajectory) -> list[float]:
-    """Volume of each object [m^3]: as simulated, or estimated as an engine would."""
+    """Volume of each object [m^3]: as simulated, or estimated from particles as by an engine; nan if unknown."""
     if trajectory.field is not None:
         return trajectory.field.volume.tolist()
     scene = trajectory.scene
@@ -103,15 +103,15 @@ def _volumes(trajectory: Trajectory) -> list[float]:
 
 
 def _materials(trajectory: Trajectory) -> dict[int, MaterialChoice]:
-    """As the simulation chose them, but for a --materials file, of which only the name is stored."""
+    """The materials of the simulation, except those of a --materials file, of which only the name is stored."""
     try:
         return choose_materials(trajectory.scene.objects, _given_materials(trajectory))
-    except InputError:  # a file of another tool
+    except InputError:  # a file by another tool
         return choose_materials([SceneObject(o.id, o.name) for o in trajectory.scene.objects])
 
 
 def _given_materials(trajectory: Trajectory) -> tuple[str, ...]:
-    """The --material options of the simulation; none in a file of another tool."""
+    """The --material options of the simulation; none for a file by another tool."""
     try:
         return texts(trajectory.scene.provenance.get("options", {}).get("material") or [], "material")
     except ValueError:
@@ -127,7 +127,7 @@ def _source(o: SceneObject, choice: MaterialChoice, given: set[str]) -> str:
 
 
 def _certainty(trajectory: Trajectory) -> str:
-    """Where the scale and the objects are from."""
+    """Notes on the sources of scale, objects and masses."""
     scene, notes = trajectory.scene, []
     known = "" if scene.has_known_scale else "; sizes and masses are relative to it"
     notes.append(f"One unit is {scene.metres_per_unit:.4g} m: {scene.scale.get('source', 'not stated')}{known}.")
@@ -140,7 +140,7 @@ def _certainty(trajectory: Trajectory) -> str:
 
 
 def _stages(trajectory: Trajectory) -> list[dict]:
-    """Provenance of each stage, from the first on."""
+    """Provenance of each stage, from the first stage on."""
     found, facts = [], trajectory.scene.provenance
     while isinstance(facts, dict) and "command" in facts:
         found.insert(0, facts)
@@ -149,7 +149,7 @@ def _stages(trajectory: Trajectory) -> list[dict]:
 
 
 def _times(trajectory: Trajectory) -> str:
-    """Wall time of each stage that the file records."""
+    """Table of the wall times of the stages that the file records."""
     steps = [(str(facts["command"]), facts["seconds"]) for facts in _stages(trajectory)
              if isinstance(facts.get("seconds"), (int, float))]  # fmt: skip
     if not steps:

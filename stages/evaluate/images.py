@@ -18,8 +18,8 @@ from stages.core.scene.images import list_photos, read_image, read_video, video_
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, Pictures, Result
 
-WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
-REPORT_FRAMES = 4  # pairs of frames shown in the report
+WINDOW, SIGMA = 11, 1.5  # size and standard deviation of SSIM's window [px]
+REPORT_FRAMES = 4  # most pairs of frames shown in the report
 
 Image = Float[Tensor, "h w 3"]
 
@@ -33,9 +33,9 @@ def psnr(predicted: Image, truth: Image) -> float:
 def ssim(predicted: Image, truth: Image) -> float:
     """Structural similarity for values in 0..1, averaged over channels and over windows entirely inside the image.
 
-    Source: Wang et al. 2004, "Image quality assessment", eq. 13: Gaussian window 11 x 11, sigma 1.5,
-    K1 = 0.01, K2 = 0.03. No window crosses the border. stages/core/kernels/splat/ssim.py pads with zeros instead, so
-    the values of `ngff reconstruct --holdout` and of the benchmarks differ slightly from these.
+    Source: Wang et al. 2004, "Image quality assessment", eq. 13: Gaussian window 11 x 11, sigma 1.5, K1 = 0.01,
+    K2 = 0.03. stages/core/kernels/splat/ssim.py instead pads images with zeros, so the values of
+    `ngff reconstruct --holdout` and of the benchmarks differ slightly.
     """
     x, y = predicted.double(), truth.double()
     mean_x, mean_y, square_x, square_y, product = (_blur(image) for image in (x, y, x * x, y * y, x * y))
@@ -54,7 +54,7 @@ def _blur(image: Image) -> Float[Tensor, "h2 w2 3"]:
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
-    """PSNR and SSIM of each pair of frames, in order; InputError if number, rate or size of the frames differ."""
+    """PSNR and SSIM of each pair of frames, in order. Raises InputError if number, rate or size of frames differ."""
     notes = _check_rates(prediction, truth)
     total = options.frames or _count(truth)
     shown = set(torch.linspace(0, total - 1, min(REPORT_FRAMES, total)).round().int().tolist())
@@ -81,7 +81,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 
 
 def _frames(path: Path) -> Iterator[Image]:
-    """The images of a folder, video or file."""
+    """The images of a folder or video, or a single image."""
     if path.is_dir():
         return (read_image(photo) for photo in list_photos(path))
     return read_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else iter([read_image(path)])
@@ -95,7 +95,7 @@ def _count(path: Path) -> int:
 
 
 def _check_rates(prediction: Path, truth: Path) -> list[str]:
-    """Notes on how frames correspond; InputError for videos of different frame rates."""
+    """Notes on how frames correspond. Raises InputError for videos with different frame rates."""
     if all(p.is_file() and p.suffix.lower() in VIDEO_SUFFIXES for p in (prediction, truth)):
         predicted, true = video_info(prediction)[1], video_info(truth)[1]
         if abs(predicted - true) > 1e-3 * true:
@@ -112,7 +112,7 @@ def _check_rates(prediction: Path, truth: Path) -> list[str]:
 
 
 def _length_error(prediction: Path, truth: Path, shared: int, options: EvaluateOptions) -> InputError:
-    """The error for files of which only the first `shared` frames exist in both."""
+    """The error for files that have only the first `shared` frames in common."""
     counts = f"{prediction}: {_count(prediction)} frames, but {truth} has {_count(truth)}"
     if options.frames is not None:
         return InputError(f"{counts}; --frames {options.frames} is more than both have, give {shared} or fewer")
@@ -120,7 +120,7 @@ def _length_error(prediction: Path, truth: Path, shared: int, options: EvaluateO
 
 
 def _check_sizes(prediction: Path, truth: Path, predicted: Tensor, true: Tensor) -> None:
-    """InputError unless both images have the same size, and are large enough for SSIM."""
+    """Raise InputError unless both images have the same size and are large enough for SSIM."""
     if predicted.shape != true.shape:
         (h, w), (h2, w2) = predicted.shape[:2], true.shape[:2]
         raise InputError(

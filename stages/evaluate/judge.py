@@ -1,8 +1,8 @@
-"""Films judged by a vision-language model: PhysR and PhotoR of the NGFF paper (ICLR 2026), section on video generation.
+"""Scores of films by a vision-language model: PhysR and PhotoR of the NGFF paper (ICLR 2026).
 
-The model sees ten evenly spaced frames of each film and answers with two scores from 0 to 1. In every repeat the films
-come in another random order, several in one question, under letters that do not reveal their origin. The prompt is our
-own.
+Source: the paper's section on video generation; the prompt is our own. The model sees ten evenly spaced frames of each
+film and answers with two scores from 0 to 1. In every repeat the films are in another random order, several in one
+question, under letters that do not reveal their origin.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 
 log = logging.getLogger(__name__)
-FRAMES, LONGEST = 10, 512  # shown of each film; longest side of a frame as sent [px]
-TRIES = 3  # replies to one question that cannot be used
+FRAMES, LONGEST = 10, 512  # frames sent of each film, and their longest side [px]
+TRIES = 3  # unusable replies after which a question is given up
 SCORES = {"PhysR": "physical_realism", "PhotoR": "photo_realism"}  # name in tables: name in replies
 PROMPT = """\
 You judge short films of objects that fall, collide, deform or come to rest. Some are camera recordings, some are \
@@ -49,15 +49,15 @@ Judge each film by itself and each score independently of the other. Answer with
 entry for each film, here {names}, for example
 {example}"""
 
-Rows = dict[str, dict[str, float]]  # name of a film in a question: scores
+Rows = dict[str, dict[str, float]]  # letter of a film in a question: its scores
 
 
 def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
-    """Mean and standard deviation of the scores of each film over the repeats.
+    """Score films; returns mean and standard deviation of the scores of each film over the repeats.
 
-    `out` is where the metrics will be written; beside it OUT.replies.json keeps every usable reply as it comes, from
-    which --resume continues. A question without a usable reply is left out, and said in the notes. Raises InputError
-    for films that cannot be read, an endpoint that fails, and where no reply at all can be used.
+    `out` is the path to which the metrics will be written. Next to it OUT.replies.json keeps every usable reply, from
+    which --resume continues. Questions without a usable reply are left out and counted in the notes. Raises InputError
+    for films that cannot be read, an endpoint that fails, and if no reply can be used.
     """
     endpoint = ChatEndpoint.from_environment(options.model, options.timeout, options.base_url)
     jpegs = [sample_frames(film, FRAMES, LONGEST) for film in tqdm(films, unit="film")]
@@ -80,7 +80,7 @@ def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
 
 
 def find_films(paths: Sequence[Path]) -> list[Path]:
-    """The films among the paths and in folders among them. InputError for other files, and for a film given twice."""
+    """The films among the paths, and in folders among them. Raises InputError for other files and repeated films."""
     films = []
     for path in map(Path, paths):
         inside = sorted(p for p in path.iterdir() if _is_film(p)) if path.is_dir() else [path]
@@ -101,7 +101,7 @@ def _is_film(path: Path) -> bool:
 
 
 def draw_questions(count: int, options: EvaluateOptions) -> list[dict[str, int]]:
-    """Films of each question, by letter: every repeat is a new random order, cut into questions of similar size."""
+    """Films of each question, by letter; each repeat has a new random order, split into questions of similar size."""
     rng, questions = random.Random(options.seed), []
     parts = math.ceil(count / options.films_per_question)
     for _ in range(options.repeats):
@@ -115,7 +115,7 @@ def draw_questions(count: int, options: EvaluateOptions) -> list[dict[str, int]]
 def _ask_all(
     endpoint: ChatEndpoint, questions: list[dict[str, int]], jpegs: list[list[bytes]], record: _Record
 ) -> list[Rows | None]:
-    """The answer to each question, None where no reply could be used."""
+    """Answers to all questions; None where no reply could be used."""
     answers = []
     for k, question in enumerate(tqdm(questions, unit="question")):
         parse = partial(parse_scores, letters=list(question))
@@ -132,7 +132,7 @@ def _ask_all(
 
 
 def _content(question: dict[str, int], jpegs: list[list[bytes]]) -> list[dict]:
-    """The message: instructions, then the name and the frames of each film."""
+    """Content of the message: instructions, then the letter and the frames of each film."""
     example = {letter: dict.fromkeys(SCORES.values(), 0.5) for letter in question}
     parts = [{"type": "text", "text": PROMPT.format(names=", ".join(question), example=json.dumps(example))}]
     for letter, i in question.items():
@@ -141,7 +141,7 @@ def _content(question: dict[str, int], jpegs: list[list[bytes]]) -> list[dict]:
 
 
 def parse_scores(reply: str, letters: list[str]) -> Rows:
-    """A reply as {letter: {PhysR, PhotoR}}. Raises InvalidReply unless every film has two numbers from 0 to 1."""
+    """Parse a reply to {letter: {PhysR, PhotoR}}. Raises InvalidReply unless each film has two numbers from 0 to 1."""
     data = json_object(reply)
     if set(data) != set(letters):
         raise InvalidReply(f"it has entries {quote(', '.join(data))}; they must be {', '.join(letters)}")
@@ -158,10 +158,10 @@ def _score(letter: str, row: object, key: str) -> float:
 
 
 class _Record:
-    """OUT.replies.json: the usable reply to each question, by its number, and what the questions depend on."""
+    """OUT.replies.json: the usable reply to each question, by number, and the settings on which questions depend."""
 
     def __init__(self, out: Path, films: Sequence[Path], endpoint: ChatEndpoint, options: EvaluateOptions):
-        check_output(out)  # said before anything is asked
+        check_output(out)  # before any question is sent
         self.path = out.with_suffix(".replies.json")
         settings = {"url": endpoint.url, "model": endpoint.model, "repeats": options.repeats, "seed": options.seed,
                     "films_per_question": options.films_per_question, "frames": FRAMES, "longest": LONGEST,
@@ -170,13 +170,13 @@ class _Record:
         self.replies: dict[str, str] = self._earlier() if options.resume and self.path.exists() else {}
 
     def add(self, k: int, reply: str) -> None:
-        """Keep the reply to the k-th question."""
+        """Store the reply to question k."""
         self.replies[str(k)] = reply
         with replacing(self.path) as part:
             part.write_text(json.dumps({**self.head, "replies": self.replies}, indent=1) + "\n")
 
     def answer(self, k: int, parse: Callable[[str], Rows]) -> Rows | None:
-        """The scores in the kept reply to the k-th question, None where there is none."""
+        """Scores in the stored reply to question k; None without one. Raises InputError if the reply was changed."""
         try:
             return parse(self.replies[str(k)]) if str(k) in self.replies else None
         except (InvalidReply, AttributeError) as error:
@@ -194,7 +194,7 @@ class _Record:
 
 
 def _result(films: Sequence[Path], scores: list[dict[str, list[float]]], notes: list[str]) -> Result:
-    """A row for each film, for each folder where there are several, and for all."""
+    """The result, with a row for each film and, if there are several folders, for each folder."""
     rows = {str(film): _summary(row) for film, row in zip(films, scores, strict=True)}
     folders = list(dict.fromkeys(film.parent for film in films))
     if len(folders) > 1:
@@ -213,7 +213,7 @@ def _summary(scores: dict[str, list[float]]) -> dict[str, float | int]:
 
 
 def _over_films(rows: list[dict[str, float | int]]) -> dict[str, float | int]:
-    """Mean and sample standard deviation of the scores of several films, each the mean of its repeats."""
+    """Mean and sample standard deviation over several films, of their mean scores over repeats."""
     judged = [row for row in rows if row["repeats"]]
     return {**_summary({name: [row[name] for row in judged] for name in SCORES}),
             "repeats": sum(row["repeats"] for row in rows)}  # fmt: skip
@@ -222,7 +222,7 @@ def _over_films(rows: list[dict[str, float | int]]) -> dict[str, float | int]:
 def _notes(
     films: Sequence[Path], jpegs: list[list[bytes]], questions: list, failed: int, endpoint: ChatEndpoint
 ) -> list[str]:
-    """Who judged, and what is missing."""
+    """Notes on the model that judged, and on missing frames and answers."""
     notes = [f"judged by {endpoint.model} at {endpoint.url}: {len(questions)} questions about {len(films)} films"]
     short = [f"{film.name} ({len(frames)})" for film, frames in zip(films, jpegs, strict=True) if len(frames) < FRAMES]
     if short:

@@ -1,4 +1,4 @@
-"""Pictures of objects in the views of the photos for the report: of a scene, and of label images beside it."""
+"""Pictures for the report that show objects in the views of photos: those of a scene, and those of label images."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stages.core.scene.scene import Scene
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Pictures, Result
 
-MAX_PICTURES = 12  # photos in the report of label images
-SCENE_PICTURES = 3  # in the report of a trajectory
-GOLDEN_RATIO = 0.618034  # steps of the hue, so that neighbouring numbers have different colours
-HUES = (0.08, 0.92)  # of labelled objects; red is for false ones
-GREY, RED = (0.6, 0.6, 0.6), (0.9, 0.1, 0.1)  # pixels that are not judged; false objects
+MAX_PICTURES = 12  # most photos in the report of label images
+SCENE_PICTURES = 3  # views in the report of a trajectory
+GOLDEN_RATIO = 0.618034  # step of the hue, so that neighbouring numbers have different colours
+HUES = (0.08, 0.92)  # range of the hues of labelled objects; red is for false objects
+GREY, RED = (0.6, 0.6, 0.6), (0.9, 0.1, 0.1)  # colours of pixels that are not judged, and of false objects
 OVERLAY = 0.6  # opacity of the colours over the photo
 
 Image = Float[Tensor, "h w 3"]
@@ -37,19 +37,19 @@ class LabelledView:
     view: int  # index of the camera
     truth: Int[Tensor, "h w"]
     found: Int[Tensor, "h w"]
-    judged: Bool[Tensor, "h w"]  # pixels that are compared
+    judged: Bool[Tensor, "h w"]  # mask of the pixels that are compared
 
 
 @dataclass(frozen=True)
 class LabelColours:
-    """Colour of each labelled and of each found object."""
+    """Colours of labelled and found objects."""
 
     truth: dict[int, Colour]
-    found: dict[int, Colour]  # that of the labelled object that it is; others are RED
+    found: dict[int, Colour]  # colours of the matching labelled objects; objects without a match are RED
 
     @classmethod
     def of(cls, labelled: dict[int, float], hits: dict[int, int]) -> LabelColours:
-        """Colours of the labelled objects, and of the found objects that are one of them (labelled to found)."""
+        """Colours of the labelled objects, and of the found objects that match them (`hits`: labelled -> found)."""
         truth = {t: _colour(i) for i, t in enumerate(labelled)}
         return cls(truth, {p: truth[t] for t, p in hits.items()})
 
@@ -63,7 +63,7 @@ def draw_pictures(
     result: Result, scene: Scene, views: list[LabelledView], colours: LabelColours, names: dict[int, str],
     options: EvaluateOptions,
 ) -> Result:  # fmt: skip
-    """The result with pictures of the first MAX_PICTURES views and the colours of the labelled objects."""
+    """Add pictures of the first MAX_PICTURES views, and a legend of the labelled objects, to the result."""
     pictures = []
     for v in views[:MAX_PICTURES]:
         photo = _photo(scene, v.view, options)
@@ -79,7 +79,7 @@ def draw_pictures(
 
 @torch.no_grad()
 def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
-    """The object with the largest share of each pixel of a view; 0 where the background's share is larger."""
+    """The object with the largest share of each pixel of a view; 0 where the share of the background is larger."""
     g, cameras = scene.gaussians, scene.cameras
     width, height = cameras.sizes[view].tolist()
     ids = g.object_id.unique()
@@ -93,9 +93,10 @@ def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
 
 
 def draw_objects(result: Result, scene: Scene, options: EvaluateOptions) -> Result:
-    """The result with photo, drawing and objects of a scene at rest in SCENE_PICTURES of its cameras.
+    """Add pictures of a scene at rest to the result: photo, rendering and objects in SCENE_PICTURES of its views.
 
-    Photos are shown as taken, where `options.photos` names their folder: trajectories do not keep the lenses.
+    Photos are included if `options.photos` names their folder. They are shown as taken, since trajectories do not store
+    lens distortion.
     """
     cameras = scene.cameras
     if cameras is None or not len(cameras):
@@ -112,7 +113,7 @@ def draw_objects(result: Result, scene: Scene, options: EvaluateOptions) -> Resu
 
 
 def paint(photo: Image, ids: Int[Tensor, "h w"], colours: dict[int, Colour], judged: Bool[Tensor, "h w"]) -> Image:
-    """The photo in grey, with objects in their colours (RED without one), white borders, and GREY where not judged."""
+    """Paint objects over a grey photo, in their colours (RED without one), with white borders; GREY if not judged."""
     out = photo.mean(2, keepdim=True).expand(-1, -1, 3).clone() * 0.6
     for i in ids[judged & (ids != 0)].unique().tolist():
         own = judged & (ids == i)
@@ -127,7 +128,7 @@ def paint(photo: Image, ids: Int[Tensor, "h w"], colours: dict[int, Colour], jud
 
 
 def _rendered(scene: Scene, view: int) -> Image:
-    """The scene in the view of a camera."""
+    """Render the scene in the view of a camera."""
     cameras, background = scene.cameras, scene.background
     width, height = cameras.sizes[view].tolist()
     drawn = rasterise(scene.gaussians, cameras.viewmats[view][None], cameras.Ks[view][None], width, height,
@@ -136,7 +137,7 @@ def _rendered(scene: Scene, view: int) -> Image:
 
 
 def _photo(scene: Scene, view: int, options: EvaluateOptions) -> Image:
-    """The photo in folder `options.photos`, undistorted and at the size of the view; without folder a rendering."""
+    """The photo in folder `options.photos`, undistorted and at the size of the view; without a folder, a rendering."""
     cameras = scene.cameras
     width, height = cameras.sizes[view].tolist()
     if options.photos is None:
@@ -147,7 +148,7 @@ def _photo(scene: Scene, view: int, options: EvaluateOptions) -> Image:
 
 
 def _read_photo(scene: Scene, view: int, folder: Path) -> Image:
-    """The photo of a camera; InputError where the folder has none."""
+    """Read the photo of a camera. Raises InputError if the folder does not contain it."""
     name = scene.cameras.names[view]
     files = [p for p in sorted(Path(folder).glob("*"))
              if p.stem == Path(name).stem and p.suffix.lower() in IMAGE_SUFFIXES]  # fmt: skip

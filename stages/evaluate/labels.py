@@ -1,7 +1,7 @@
 """Comparison of a scene's objects with label images of its photos: IoU of each object, recall and panoptic quality.
 
-Each Gaussian's object is composited into the view of a labelled photo, and each pixel shows the object with the largest
-share. Labelled and found objects are compared over all labelled photos together.
+The objects of the Gaussians are alpha composited in the view of each labelled photo; a pixel belongs to the object with
+the largest share. Labelled and found objects are compared over all labelled photos together.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 
-MIN_FOUND_PIXELS = 60  # of a found object in all photos [px of the views]; smaller ones are no objects
+MIN_FOUND_PIXELS = 60  # fewest pixels of a found object in all views; smaller ones are ignored
 NAMES_EXAMPLE = '{"1": {"name": "duck", "core": true}}'
-MATCHING_IOU = 0.5  # above which a found object is the labelled one (Kirillov et al. 2019)
+MATCHING_IOU = 0.5  # IoU above which a found object counts as the labelled object (Kirillov et al. 2019)
 
 
 @dataclass(frozen=True)
@@ -40,31 +40,31 @@ class LabelledObject:
     """An object of names.json."""
 
     name: str
-    core: bool  # whether it must be found; others count neither as missed nor as false
+    core: bool  # must be found; other objects count neither as missed nor as false
 
 
 @dataclass(frozen=True)
 class PanopticScores:
-    """Objects of the truth and of the prediction, and their overlap, by number."""
+    """Labelled and found objects and their overlap, by object number."""
 
-    iou: dict[int, float]  # of each labelled object with the found one matched to it
-    matched: dict[int, int]  # labelled to found, of any IoU above 0
-    truth_pixels: dict[int, int]  # of each labelled object
-    found_pixels: dict[int, int]  # of each found object of MIN_FOUND_PIXELS or more
-    pixels: int  # that are compared, the background included
+    iou: dict[int, float]  # IoU of each labelled object and the found object matched to it; 0 without a match
+    matched: dict[int, int]  # labelled -> found object, for any IoU above 0
+    truth_pixels: dict[int, int]  # number of pixels of each labelled object
+    found_pixels: dict[int, int]  # number of pixels of each found object with at least MIN_FOUND_PIXELS
+    pixels: int  # number of compared pixels, including the background
 
     @property
     def hits(self) -> dict[int, int]:
-        """Matched objects (labelled to found) with an IoU above MATCHING_IOU."""
+        """Matched objects (labelled -> found) with an IoU above MATCHING_IOU."""
         return {t: p for t, p in self.matched.items() if self.iou[t] > MATCHING_IOU}
 
     @property
     def false(self) -> list[int]:
-        """Found objects that match no labelled one."""
+        """Found objects that match no labelled object."""
         return [p for p in self.found_pixels if p not in self.hits.values()]
 
     def summary(self) -> dict[str, float | int]:
-        """The metrics over all objects, by their names in tables; SQ, RQ, PQ by Kirillov et al. 2019."""
+        """Metrics over all objects, by their names in tables; SQ, RQ and PQ as in Kirillov et al. 2019."""
         hits, asked, found = len(self.hits), len(self.iou), len(self.found_pixels)
         sq = sum(self.iou[t] for t in self.hits) / hits if hits else 0.0
         rq = hits / ((asked + found) / 2) if asked + found else 0.0
@@ -84,7 +84,7 @@ class PanopticScores:
 
 @dataclass
 class LabelOverlap:
-    """Number of pixels of each pair of a labelled and a found object, summed over images; 0 is the background."""
+    """Number of pixels of each pair (labelled, found) of objects, summed over images; 0 is the background."""
 
     table: Counter[tuple[int, int]] = field(default_factory=Counter)
 
@@ -96,7 +96,7 @@ class LabelOverlap:
             self.table[divmod(pair, base)] += n
 
     def scores(self) -> PanopticScores:
-        """Objects matched one to one with the largest sum of IoU."""
+        """Match objects one to one with the largest sum of IoU."""
         truth, found = Counter(), Counter()
         for (t, p), n in self.table.items():
             truth[t] += n
@@ -115,10 +115,10 @@ class LabelOverlap:
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
-    """The metrics of a scene against the folder `truth` of label images; pictures of each photo if a report is asked.
+    """Compare a scene with the folder `truth` of label images; with a report, pictures of photos are included.
 
-    Raises InputError for a scene without cameras, a folder without names.json or without a label image of a photo of
-    the scene, and label images that are not 8-bit with one channel, or of another size than their photo.
+    Raises InputError for a scene without cameras, a folder without names.json or without a label image of any photo of
+    the scene, and label images that are not 8-bit with one channel or that differ in size from their photo.
     """
     scene, names = read_scene(prediction), read_label_names(truth)
     files = label_files(truth, prediction, scene.cameras)
@@ -144,7 +144,10 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 
 
 def read_label_names(folder: Path) -> dict[int, LabelledObject]:
-    """The objects of names.json by number: {"1": {"name": "duck", "core": true}}, or {"1": "duck"}; core by default."""
+    """Read the objects of names.json by number: {"1": {"name": "duck", "core": true}} or {"1": "duck"}.
+
+    Objects are core by default. Raises InputError for an invalid or absent file.
+    """
     path = must_exist(folder / "names.json", f"the names of the labelled objects, {NAMES_EXAMPLE},")
     try:
         rows = numbered(read_json(path), "a label").items()
@@ -156,7 +159,7 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
 
 
 def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:
-    """The label image NAME.png of each camera's photo NAME that has one; InputError where none has."""
+    """Label images NAME.png of the cameras' photos NAME, by camera index. Raises InputError if there are none."""
     if cameras is None or not len(cameras):
         raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
     images = {path.stem: path for path in _label_images(folder)}
@@ -168,19 +171,19 @@ def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict
 
 
 def _label_images(folder: Path) -> list[Path]:
-    """The PNG files of a folder, without hidden ones, sorted by name."""
+    """The PNG files of a folder, sorted by name, without hidden files."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() == ".png" and not p.name.startswith("."))
 
 
 def read_truth(file: Path, cameras: Cameras, view: int, undistorted: bool = False) -> Int[Tensor, "h w"]:
-    """A label image in the view of its photo's camera: undistorted, and at the view's size.
+    """Read a label image in the view of its photo's camera: undistorted, and at the size of the view.
 
-    Raises InputError unless it is 8-bit, of one channel, and of the size of the photo (of the view, if `undistorted`).
+    Raises InputError unless it is 8-bit with one channel and has the size of the photo (of the view, if `undistorted`).
     """
     labels = read_labels(file, max_bits=8)
     height, width = labels.shape
     (w, h), known = photo_of(cameras, view, undistorted)[1], cameras.photos is not None and not undistorted
-    # a view may be smaller, and its sides are rounded to whole pixels
+    # a view may be smaller than its labels, and its sides are rounded to whole pixels
     same = (width, height) == (w, h) if known else abs(width / height * h - w) <= 0.5 * (1 + width / height)
     if not same:
         raise InputError(

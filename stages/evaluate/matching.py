@@ -12,9 +12,9 @@ from stages.evaluate.align import Pairs, ReferenceFrame
 
 
 def match_objects(prediction: ReferenceFrame, truth: ReferenceFrame, names: list[str]) -> tuple[Pairs, str]:
-    """Pairs (predicted, true) of objects, and a sentence on how they were found: by name, by id, or by centre.
+    """Match objects by name, by id or by centre; returns pairs (predicted, true) and a sentence on how they were found.
 
-    With `names` only those objects of the truth are matched, and the prediction may have more. Ids are used only if
+    With `names` only these objects of the truth are matched, and the prediction may have more. Ids are used only if
     they agree with the nearest centres, since the numbering of segmented objects is arbitrary. Raises InputError if
     the numbers of objects differ or a name does not exist.
     """
@@ -50,7 +50,7 @@ def _nearest_pairs(
 
 
 def object_labels(objects: list[SceneObject]) -> list[str]:
-    """Names for tables, with the id appended to names that occur more than once."""
+    """Names for tables; the id is appended to names that occur more than once."""
     names = [o.name for o in objects]
     return [o.name if names.count(o.name) == 1 else f"{o.name} {o.id}" for o in objects]
 
@@ -60,7 +60,7 @@ def _names(objects: list[SceneObject]) -> str:
 
 
 def _select(truth: ReferenceFrame, names: list[str]) -> list[SceneObject]:
-    """The objects of the truth with these names; all without names."""
+    """The objects of the truth with these names; without names, all. Raises InputError for an unknown name."""
     missing = [name for name in names if name not in {o.name for o in truth.objects}]
     if missing:
         raise InputError(f"--objects {','.join(missing)}: {truth.file} has {_names(list(truth.objects))}")

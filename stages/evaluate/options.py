@@ -1,4 +1,4 @@
-"""Options of the stage evaluate."""
+"""Options of the evaluate stage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.options import option
 
-MAX_FILMS_PER_QUESTION = 26  # films in one question, which have letters as names
+MAX_FILMS_PER_QUESTION = 26  # most films in one question, as they are named by letters
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""HTML report in one file: table, curves as inline SVG, and inline images."""
+"""HTML report in one file: a table, curves as inline SVG, and inline images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.scene.files import replacing
 from stages.core.scene.images import resize, write_png
 from stages.evaluate.result import Curve, Pictures, Result, format_number
 
-WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
+WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # size of the plot, and its margins for labels [px]
 LINE_COLOURS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
 MAX_IMAGE_SIDE = 420  # longest side of an image in the report [px]
 STYLE = """
@@ -27,7 +27,7 @@ figcaption, .notes { color: #555 } svg text { font: 12px system-ui, sans-serif; 
 
 
 def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> None:
-    """Write the report; it refers to no other file. One of trajectories has the player of the prediction."""
+    """Write the report, which refers to no other file. A report of trajectories includes a player of the prediction."""
     title = f"{Path(prediction).name} against {Path(truth).name}"
     body = [f"<h1>{escape(title)}</h1>", _table(result)]
     body += [f'<p class="notes">{escape(note)}</p>' for note in result.notes]
@@ -57,7 +57,7 @@ def _table(result: Result) -> str:
 
 
 def _plot(result: Result) -> str:
-    """Plot of the curves in the unit of the axis; SSIM has another unit and is in the JSON only."""
+    """Plot the curves in the unit of the axis; SSIM has another unit and is only in the JSON."""
     curves = [c for c in result.curves if c.name != "SSIM"]
     count = len(curves[0].values)
     top = _round_up(max((v for c in curves for v in c.values if math.isfinite(v)), default=1.0))
@@ -103,7 +103,7 @@ def _time(fraction: float, count: int, seconds: float | None) -> str:
 
 
 def _round_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten."""
+    """Round up to 1, 2 or 5 times a power of ten."""
     if value <= 0:
         return 1.0
     step = 10.0 ** math.floor(math.log10(value))
@@ -129,7 +129,7 @@ def _figure(pictures: Pictures) -> str:
 
 
 def _png(image: Float[Tensor, "h w 3"]) -> str:
-    """Base64 of a PNG, reduced to MAX_IMAGE_SIDE."""
+    """Base64 of an image as PNG, reduced to MAX_IMAGE_SIDE."""
     h, w = image.shape[:2]
     factor = min(1.0, MAX_IMAGE_SIDE / max(h, w))
     image = resize(image, max(1, round(w * factor)), max(1, round(h * factor)))

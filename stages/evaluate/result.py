@@ -1,4 +1,4 @@
-"""Result of a comparison, and its representation as table and JSON."""
+"""The result of a comparison, and its representation as table and JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Curve:
-    """One value per frame."""
+    """A series with one value per frame."""
 
     name: str
     values: list[float]
@@ -27,17 +27,17 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Result:
-    """Metrics by name: overall, and of each object (none for images)."""
+    """Metrics by name: overall, and of each object (or film; none for images)."""
 
-    kind: str  # of the compared data: "trajectories", "pictures", "scenes" or "labels"
+    kind: str  # kind of the compared data: "trajectories", "pictures", "scenes", "labels" or "films"
     overall: dict[str, float | int]
     parts: dict[str, dict[str, float | int]]
-    notes: list[str]  # sentences on how items were matched
+    notes: list[str]  # sentences, for example on how items were matched
     curves: list[Curve] = field(default_factory=list)
     curve_title: str = ""
-    fps: float | None = None  # of the curves, where frames have a time
+    fps: float | None = None  # frame rate of the curves, if frames have a time
     pictures: list[Pictures] = field(default_factory=list)
-    legend: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of the pictures: name to RGB 0..1
+    legend: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of the pictures: name -> RGB 0..1
 
     def rows(self) -> list[tuple[str, dict[str, float | int]]]:
         """Rows of the table: each object, then "all"."""
@@ -58,7 +58,7 @@ def format_number(value: float | int | None) -> str:
 
 
 def format_table(result: Result) -> str:
-    """Aligned text with one row per object and the overall metrics last."""
+    """Aligned text with one row per object; the overall metrics are last."""
     columns = result.columns()
     cells = [["", *columns]] + [[name, *(format_number(row.get(c)) for c in columns)] for name, row in result.rows()]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns) + 1)]
@@ -69,7 +69,7 @@ def format_table(result: Result) -> str:
 
 
 def to_json(result: Result) -> dict:
-    """Values for JSON; undefined is null, and an infinite PSNR (identical images) the string "inf"."""
+    """Values for JSON; undefined values are null, and an infinite PSNR (identical images) is the string "inf"."""
     return {
         "kind": result.kind,
         "overall": _plain(result.overall),

@@ -23,14 +23,14 @@ from stages.evaluate.result import Result
 
 @dataclass(frozen=True)
 class NearestNeighbours:
-    """For each point of one point cloud, the nearest point of the other."""
+    """The nearest point in another cloud for each point of a cloud."""
 
     distance: Float[Tensor, "n"]
     index: Int[Tensor, "n"]
 
 
 def nearest_neighbours(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> NearestNeighbours:
-    """For each of `points` the nearest of `others`."""
+    """Find the nearest of `others` for each of `points`."""
     distance, index = knn(others, points, 1)
     return NearestNeighbours(distance[:, 0], index[:, 0])
 
@@ -58,9 +58,9 @@ def colour_error(
 
 
 def label_iou(predicted: Int[Tensor, "n"], true: Int[Tensor, "n"]) -> dict[int, tuple[int, float]]:
-    """Intersection over union of each true object with the predicted object matched to it (0 without a match).
+    """Intersection over union (IoU) of each true object and the predicted object matched to it; 0 without a match.
 
-    Both label the same points; 0 is the background. Objects are matched one to one, maximising the sum of IoU.
+    Both tensors label the same points; 0 is the background. Objects are matched one to one with the largest sum of IoU.
     Returns {true id: (predicted id, IoU)}.
     """
     from scipy.optimize import linear_sum_assignment
@@ -121,7 +121,7 @@ def scene_reference_frame(path: Path, scene: Scene) -> ReferenceFrame:
 
 
 def _surfaces(path: Path, scene: Scene) -> Gaussians:
-    """The Gaussians above SURFACE_OPACITY; InputError if there are none."""
+    """The Gaussians with an opacity above SURFACE_OPACITY. Raises InputError if there are none."""
     g = scene.gaussians[scene.gaussians.opacities > SURFACE_OPACITY]
     if not len(g):
         raise InputError(f"{path}: no Gaussian has an opacity above {SURFACE_OPACITY}, so there is no surface to "

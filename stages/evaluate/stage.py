@@ -1,6 +1,6 @@
-"""Stage evaluate: a prediction and the truth (trajectories, scenes, videos, or label images) -> metrics.json.
+"""The evaluate stage: a prediction and the truth (trajectories, scenes, videos or label images) -> metrics.json.
 
-With --judge instead: films, without a truth, scored by a vision-language model.
+With --judge, films are instead scored without a truth by a vision-language model.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from stages.evaluate.result import Result, format_table, to_json
 
 log = logging.getLogger(__name__)
 
-# kind of the truth (a folder counts as images) -> "module:function" that takes (prediction, truth, options)
+# kind of the data (a folder counts as images) -> "module:function" that takes (prediction, truth, options)
 COMPARISONS = {
     "trajectory": "stages.evaluate.trajectories:compare",
     "scene": "stages.evaluate.scenes:compare",
     "image": "stages.evaluate.images:compare",
     "video": "stages.evaluate.images:compare",
-    "labels": "stages.evaluate.labels:compare",  # of a scene: a folder of label images of its photos
+    "labels": "stages.evaluate.labels:compare",  # a scene, and a folder of label images of its photos
 }
-OPTION_KINDS = {  # options that apply to some kinds of data only
+OPTION_KINDS = {  # option -> kinds of data to which it applies; other options apply to all
     "align": ("trajectory", "scene"),
     "frames": ("trajectory", "image", "video"),
     "resample": ("trajectory",),
@@ -44,10 +44,10 @@ def run(
     prediction: Path | Sequence[Path], truth: Path | None, out: Path | None = None,
     options: EvaluateOptions = DEFAULTS, as_json: bool = False,
 ) -> dict:  # fmt: skip
-    """Compare a prediction with the truth, or judge films; print a table (or JSON) and return the metrics written.
+    """Compare a prediction with the truth, or judge films; print a table (or JSON), and write and return the metrics.
 
-    They are written to `out`, by default metrics.json next to the (first) prediction. With `options.judge` the
-    prediction is one film or several, or folders of them, and the truth is None. Raises InputError for files that
+    Metrics are written to `out`, by default metrics.json next to the (first) prediction. With `options.judge` the
+    prediction is one or several films or folders of films, and the truth is None. Raises InputError for files that
     cannot be compared and for options that do not apply to them.
     """
     predictions = [Path(p) for p in ([prediction] if isinstance(prediction, (str, Path)) else prediction)]
@@ -73,7 +73,7 @@ def run(
 
 
 def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptions) -> tuple[Result, list[Path]]:
-    """The metrics of a prediction, and both files."""
+    """The metrics of a prediction, and the paths of both files."""
     if truth is None:
         raise InputError(f"{predictions[0]}: name the truth with --against, or have films scored with --judge")
     if len(predictions) > 1:
@@ -85,7 +85,7 @@ def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptio
 
 
 def _judge(films: list[Path], truth: Path | None, out: Path, options: EvaluateOptions) -> tuple[Result, list[Path]]:
-    """The scores of films, and their files."""
+    """The scores of films, and their paths."""
     from stages.evaluate.judge import find_films, judge
 
     if truth is not None:
@@ -96,7 +96,7 @@ def _judge(films: list[Path], truth: Path | None, out: Path, options: EvaluateOp
 
 
 def _common_kind(prediction: Path, truth: Path) -> str:
-    """Kind of data of both, which is "labels" for a scene and a folder; InputError where they differ."""
+    """The common kind of data; "labels" for a scene and a folder. Raises InputError if the kinds differ."""
     kinds = _kind(prediction), _kind(truth)
     if kinds[0] == "scene" and truth.is_dir():
         return "labels"
@@ -108,7 +108,7 @@ def _common_kind(prediction: Path, truth: Path) -> str:
 
 
 def _kind(path: Path) -> str:
-    """Kind of data of a path, by its suffix; InputError unless it can be compared and exists."""
+    """Kind of data of a path, by its suffix. Raises InputError unless it exists and can be compared."""
     if path.is_dir():
         return "image"
     suffix = path.suffix.lower()
@@ -121,7 +121,7 @@ def _kind(path: Path) -> str:
 
 
 def _check_options(kind: str, options: EvaluateOptions) -> None:
-    """InputError for an option that has no effect on this kind of data."""
+    """Raise InputError for an option that does not apply to this kind of data."""
     for name, kinds in OPTION_KINDS.items():
         if getattr(options, name) != getattr(DEFAULTS, name) and kind not in kinds:
             only = "; it belongs to --judge" if kinds == ("films",) else "; omit it"

@@ -1,4 +1,4 @@
-"""Comparison of two trajectories: the metrics of dynamics.py at corresponding points."""
+"""Comparison of two trajectories by the metrics of dynamics.py at corresponding points."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from stages.evaluate.matching import match_objects, object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, Result
 
-SAME_POINT = 1e-3  # largest distance at rest of identical keypoints [size of the object]
+SAME_POINT = 1e-3  # largest distance at rest between identical keypoints [size of the object]
 
 
 @dataclass(frozen=True)
 class Track:
-    """The keypoints of a trajectory in every frame, with their reference frame."""
+    """The keypoints of a trajectory in all frames, with their reference frame."""
 
     frame: ReferenceFrame
     dt: float  # [s]
@@ -37,12 +37,12 @@ class Track:
         return len(self.positions)
 
     def of(self, id: int) -> tuple[Tensor, Tensor]:
-        """One object's keypoints at rest (p, 3) and in every frame (t, p, 3)."""
+        """Keypoints of an object at rest (p, 3) and in all frames (t, p, 3)."""
         own = self.object_id == id
         return self.rest[own], self.positions[:, own]
 
     def transformed(self, similarity: Similarity) -> Track:
-        """The same after a similarity transform."""
+        """Apply a similarity transform."""
         rest = similarity(self.rest)
         frame = self.frame.transformed(similarity)
         return replace(self, frame=frame, rest=rest, positions=similarity(self.positions))
@@ -50,17 +50,20 @@ class Track:
 
 @dataclass(frozen=True)
 class MatchedMotion:
-    """Both motions at the same points, padded to the largest number of points per object."""
+    """Predicted and true motion of the same points, padded to the largest number of points per object."""
 
     names: list[str]
     predicted: Float[Tensor, "t o p 3"]
     truth: Float[Tensor, "t o p 3"]
     mask: Bool[Tensor, "o p"]
-    seen: Bool[Tensor, "t o"] | None = None  # frames in which the truth has each object; None: all
+    seen: Bool[Tensor, "t o"] | None = None  # mask of the frames in which the truth has each object; None: all
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
-    """Match objects and points, then compute every metric per object and over all objects."""
+    """Match objects and points, and compute all metrics per object and over all objects.
+
+    Raises InputError if the files cannot be matched with these options.
+    """
     mine, true_scene = read_trajectory(prediction), read_trajectory(truth)
     predicted, true = _track(mine), _track(true_scene)
     notes: list[str] = []
@@ -85,7 +88,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 
 
 def _seen(truth: Trajectory, pairs: Pairs, frames: int, notes: list[str]) -> Bool[Tensor, "t o"] | None:
-    """The frames in which a tracked truth has each object of the pairs; None where it has all."""
+    """Mask of the frames in which a tracked truth has each object of the pairs; None if it has all of them."""
     if truth.confidence is None:
         return None
     column = {o.id: i for i, o in enumerate(truth.scene.objects)}
@@ -97,7 +100,7 @@ def _seen(truth: Trajectory, pairs: Pairs, frames: int, notes: list[str]) -> Boo
 
 
 def _with_plausibility(result: Result, measures: dict, ids: list[int]) -> Result:
-    """The result with what `ngff simulate` measured of the prediction, if the file has it; overall the largest."""
+    """Add the plausibility measures of `ngff simulate`, if the prediction has them; overall values are the largest."""
     found = [measures.get("objects", {}).get(str(id), {}) for id in ids]
     parts = {name: {**metrics, **more} for (name, metrics), more in zip(result.parts.items(), found, strict=True)}
     largest = {name: max(f[name] for f in found if name in f) for name in dict.fromkeys(k for f in found for k in f)}
@@ -144,7 +147,7 @@ def _floats(metrics: dict[str, Tensor]) -> dict[str, float]:
 
 
 def _same_frames(predicted: Track, true: Track, options: EvaluateOptions, notes: list[str]) -> tuple[Track, Track]:
-    """Both tracks at the same times, as the options select them; InputError where the options leave a difference."""
+    """Both tracks at the same times, as the options ask. Raises InputError if frames or rates still differ."""
     files = predicted.frame.file, true.frame.file
     if options.resample:
         predicted = _resampled(predicted, true)
@@ -172,7 +175,7 @@ def _same_frames(predicted: Track, true: Track, options: EvaluateOptions, notes:
 
 
 def _resampled(predicted: Track, true: Track) -> Track:
-    """The prediction interpolated linearly at the frame times of the truth, up to the end of the prediction."""
+    """Interpolate the prediction linearly at the frame times of the truth, up to the end of the prediction."""
     count = min(len(true), int((len(predicted) - 1) * predicted.dt / true.dt + 1e-6) + 1)
     index = torch.arange(count, dtype=torch.float64) * true.dt / predicted.dt
     first = index.floor().long().clamp(max=max(len(predicted) - 2, 0))
@@ -183,7 +186,7 @@ def _resampled(predicted: Track, true: Track) -> Track:
 
 
 def _same_points(predicted: Track, true: Track, pairs: Pairs, notes: list[str]) -> MatchedMotion:
-    """The keypoints of the truth, with their predicted positions."""
+    """Motion at the keypoints of the truth; the prediction is transferred to them if its keypoints are different."""
     motions, truths, transferred = [], [], []
     for a, b in pairs:
         (rest, moving), (true_rest, true_moving) = predicted.of(a.id), true.of(b.id)
@@ -211,7 +214,7 @@ def _same_keypoints(a: Float[Tensor, "p 3"], b: Float[Tensor, "q 3"]) -> bool:
 
 
 def _padded(series: list[Float[Tensor, "t _ 3"]]) -> Float[Tensor, "t o p 3"]:
-    """Stacked, with zeros where an object has fewer points than the largest number."""
+    """Stack series, padded with zeros to the largest number of points."""
     count = max(s.shape[1] for s in series)
     return torch.stack([torch.nn.functional.pad(s, (0, 0, 0, count - s.shape[1])) for s in series], 1)
 
@@ -223,7 +226,7 @@ def transfer_motion(
 
     The offset of each point from the keypoints is rotated and stretched with their local deformation.
     """
-    from stages.core.physics.keypoints import bind_gaussians  # they import Warp and SciPy
+    from stages.core.physics.keypoints import bind_gaussians  # imports Warp and SciPy
     from stages.core.physics.skinning import Skinning
 
     q = len(points)

@@ -30,12 +30,12 @@ from stages.segment.stage import run as segment
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
-SPACING = 0.012  # between Gaussians on a surface [m]
+SPACING = 0.012  # distance between Gaussians on a surface [m]
 LIFT = 0.3  # height from which the objects are dropped [m]
 
 
 def surface(points: torch.Tensor, rgb: tuple, object_id: int) -> Gaussians:
-    """Opaque round Gaussians of one colour, with a little noise as in photos."""
+    """Opaque isotropic Gaussians of one colour, with slight noise as in photos."""
     n = len(points)
     rng = torch.Generator().manual_seed(object_id)
     colours = torch.tensor(rgb) + 0.03 * torch.randn(n, 3, generator=rng)
@@ -46,7 +46,7 @@ def surface(points: torch.Tensor, rgb: tuple, object_id: int) -> Gaussians:
 
 
 def grid(*sides: float) -> torch.Tensor:
-    """Points of a regular grid, centred in x and y."""
+    """Points of a regular grid with these side lengths [m], centred in x and y."""
     axes = [torch.arange(0, side, SPACING) for side in sides]
     points = torch.cartesian_prod(*axes, *([torch.zeros(1)] * (3 - len(sides))))
     return points - torch.tensor([sides[0] / 2, sides[1] / 2, 0.0])
@@ -78,7 +78,7 @@ def main(out: Path) -> dict:
     write_scene(out / "truth.ply", truth)
     write_scene(out / "scene.ply", replace(truth, gaussians=unlabelled, objects=()))
 
-    exact = SegmentOptions(backend="geometric", names="1=red block,2=blue block")  # for shapes without noise
+    exact = SegmentOptions(backend="geometric", names="1=red block,2=blue block")  # suits clean shapes
     segment(out / "scene.ply", out / "labelled.ply", exact)
     labels = evaluate(out / "labelled.ply", out / "truth.ply", out / "labels.json", EvaluateOptions())
     assert labels["overall"]["IoU"] > 0.9

@@ -31,17 +31,17 @@ from stages.simulate.stage import run as simulate
 
 HERE = Path(__file__).parent
 PROMPTS = {"pillow": ("pillow_up.json", (0.0, 0.0, 1.0)), "cloth": ("cloth_left.json", (-1.0, 0.0, 0.0))}
-KEEP_EVERY = 6  # only every sixth Gaussian of an object is used
+KEEP_EVERY = 6  # only one in this many Gaussians of an object is used
 
 
 def scene(name: str) -> Scene:
-    """An object of the data set at its usual size on a floor."""
+    """A scene with an object of the data set, at its usual size, on a floor."""
     g = make_object(name)[::KEEP_EVERY]
     scale = OBJECTS[name].scale
     means = scale * g.means
     means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
     body = replace(g, means=means, scales=1.3 * KEEP_EVERY**0.5 * scale * g.scales)
-    floor = sheet(3.0, 3.0, 0.03).moved((0.0, 0.0, -0.02))  # drawn slightly lower, as soft objects sag
+    floor = sheet(3.0, 3.0, 0.03).moved((0.0, 0.0, -0.02))  # slightly lower than z = 0, as soft objects sag
     tiles = (floor.points[:, :2] / 0.3).floor().sum(1).remainder(2)[:, None]
     table = to_gaussians(floor, 0.55 + 0.2 * tiles.expand(-1, 3), 0, width=0.8, widest=0.1)
     table = replace(table, sh=torch.nn.functional.pad(table.sh, (0, 0, 0, body.sh.shape[1] - 1)))
@@ -49,7 +49,9 @@ def scene(name: str) -> Scene:
 
 
 def compare(name: str, out: Path, steps: int = 60, **options) -> tuple[dict, dict]:
-    """Metrics of ngff against mpm, and the maximum displacement along the force by each engine [m]."""
+    """Simulate one object by both engines; returns the metrics of ngff against mpm, and for each engine the largest
+    displacement along the force [m].
+    """
     forces, along = PROMPTS[name]
     write_scene(out / f"{name}.ply", scene(name))
     files = {engine: out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")}

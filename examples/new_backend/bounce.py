@@ -41,7 +41,7 @@ def simulate(scene: Scene, out: Path) -> None:
             for mask, path in zip(of, paths, strict=True):
                 positions[mask, 2] += path[t] - path[0]
             traj.append(positions, torch.stack([positions[mask].mean(0) for mask in of]), upright)
-    assert all(path[-1] < max(path[0], 0.05) + 1e-6 for path in paths)  # nothing ends higher than it began
+    assert all(path[-1] < max(path[0], 0.05) + 1e-6 for path in paths)  # no object ends higher than it started
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Command lines only: parse, make one Options, call one run(). The scripts start here, before anything is imported."""
+"""The command lines: each command parses its options and calls one run().
+
+The scripts start here, before anything is imported.
+"""
 
 import sys
 from importlib import import_module
@@ -17,6 +20,6 @@ def ngff_lab() -> None:
 def _start(module: str) -> None:
     try:
         import_module(module).main()
-    except KeyboardInterrupt:  # before main catches it
+    except KeyboardInterrupt:  # during imports, before main handles it
         print("ngff: interrupted", file=sys.stderr)
         sys.exit(130)

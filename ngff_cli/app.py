@@ -162,7 +162,7 @@ def evaluate(
 
 
 def main() -> None:
-    """Run the command that this process was started with."""
+    """Run the command in this process's arguments."""
     run_command_line(app)
 
 

@@ -1,4 +1,4 @@
-"""`ngff-lab bench`: quality and speed, each compared with a baseline measured in the same run."""
+"""`ngff-lab bench`: benchmarks of quality and speed, each with a baseline that is measured in the same run."""
 
 from ngff_cli import bench_motion, bench_scenes, bench_speed
 from ngff_cli.options import new_app

@@ -1,4 +1,4 @@
-"""Benchmarks of motion: simulated, predicted, tracked and fitted, against theory or the truth."""
+"""Benchmarks of simulated, predicted, tracked and fitted motion, compared with theory or the truth."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,7 +41,7 @@ def bench_dynamics(
         Path | None, Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
     ] = None,
     out: Annotated[
-        Path, Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table and plots")
+        Path, Option("-o", "--out", help="results (.json); existing results are kept; also writes a table and plots")
     ] = Path("results.json"),
     nudged: Annotated[
         Path | None, Option(help="data set of the same scenes with initial positions shifted by 1 mm")
@@ -104,5 +104,5 @@ add_benchmark(
     "fit-films",
     "stages.lab.bench.fit_films:run",
     FilmBenchOptions,
-    "Material estimation from films: errors of the parameters, beside those from the motion as it was tracked.",
+    "Material estimation from films: errors of the parameters, compared with estimation from tracked motion.",
 )

@@ -1,4 +1,4 @@
-"""Benchmarks of scenes: cameras, views, objects and what was filled in, against the truth."""
+"""Benchmarks of scenes: cameras, views, segmented objects and completed surfaces, compared with the truth."""
 
 from pathlib import Path
 from typing import Annotated
@@ -74,7 +74,7 @@ def bench_segment(
 ) -> None:
     """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
 
-    Of photo sets: objects in real photos against label images: recall, IoU and panoptic quality.
+    With photo sets: objects in real photos compared with label images, by recall, IoU and panoptic quality.
     """
     if not sets:
         if chosen.labels or chosen.labelled:

@@ -18,7 +18,7 @@ Sheet = Annotated[Path | None, Option(help="contact sheet to write (.jpg)")]
 
 
 def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
-    """The option --from of a command, which says what its meshes are for and of what kind they are."""
+    """The option --from of a command; its help says what kind of meshes are expected and how they are used."""
     help_text = f"{kind} (.obj .glb .ply ...), or folder of meshes, {use}; repeatable"
     return Option("--from", metavar="MESH", help=help_text)
 
@@ -155,7 +155,7 @@ def heldout(
     meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
     options: HeldoutOptions,
 ) -> None:
-    """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
+    """Simulate scenes of objects other than the ten; by default of eight that are never used in training."""
     from stages.lab.dataset.heldout import run
 
     print(run(out, options, meshes))

@@ -1,4 +1,4 @@
-"""Check of the installation: each finding with its remedy."""
+"""The check of the installation; each finding includes a remedy."""
 
 import json
 import os
@@ -16,12 +16,12 @@ from stages.refine.options import BACKENDS as COMPLETERS
 from stages.refine.options import UPSCALERS
 from stages.segment.options import BACKENDS as SEGMENTERS
 
-TABLE_WIDTH, SUBJECT_WIDTH = 100, 18  # columns
-NETWORKS = {  # command that runs a published network: its row
+TABLE_WIDTH, SUBJECT_WIDTH = 100, 18  # [characters]
+NETWORKS = {  # command that runs a published network: name and row of its backend
     **{f"segment --backend {name}": (name, row) for name, row in SEGMENTERS.items() if row.find_weights},
     **{f"refine --completer {name}": (name, row) for name, row in COMPLETERS.items() if row.find_weights},
 }
-OPTIONAL = {  # package of pyproject.toml's extras: (what needs it, the extra that installs it)
+OPTIONAL = {  # package in an extra of pyproject.toml: (what needs it, name of the extra)
     "huggingface_hub": ("--download", "hub"),
     **{row.package: (user, row.extra) for user, (_, row) in NETWORKS.items() if row.package},
     "usd-core": ("ngff render -o x.usdc", "usd"),
@@ -48,7 +48,7 @@ class Finding(NamedTuple):
 
 
 def check_installation() -> Iterator[Finding]:
-    """Results of all checks in order: packages, GPU, codec, disk, weights of each network, optional packages."""
+    """Run all checks in order: packages, GPU, codec, disk, weights of each network, optional packages."""
     detail = f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}"
     yield Finding(True, "ngff", detail)
     for check in (_torch, _gpu, _warp, _colmap, _codec, _disk):
@@ -59,7 +59,7 @@ def check_installation() -> Iterator[Finding]:
 
 
 def write_findings(findings: Iterable[Finding], out: Path | None = None) -> Iterator[str]:
-    """The findings as lines of text; to `out`, if given, as a JSON list."""
+    """Yield the findings as lines of text; write them to `out`, if given, as a JSON list."""
     rows = []
     for finding in findings:
         rows.append(finding._asdict())
@@ -134,7 +134,7 @@ def _own_weights() -> Iterator[Finding]:
 
 
 def _published_weights() -> Iterator[Finding]:
-    """Weights of networks trained by others, found by file name only; loading verifies their content."""
+    """Weights of networks published by others, checked by file name only; loading verifies their content."""
     from stages.core.backends import load
     from stages.core.models.matching import weights as matcher
     from stages.core.models.pi3 import weights as pi3
@@ -147,7 +147,7 @@ def _published_weights() -> Iterator[Finding]:
     for user, (name, row) in NETWORKS.items():
         yield _weights(name, load(row.find_weights), f"ngff {user} --download")
     for name, row in UPSCALERS.items():
-        if row.find_weights:  # not by --download; the command says where they are
+        if row.find_weights:  # --download does not fetch them; the error of the command says where they are
             yield _weights(name, load(row.find_weights), f"ngff refine --completer diffsplat --upscale {name}")
 
 

@@ -1,4 +1,4 @@
-"""`ngff-lab`: its commands, of which training.py, data.py and bench.py define most."""
+"""`ngff-lab`: its commands, most of which are defined in training.py, data.py and bench.py."""
 
 import math
 from pathlib import Path
@@ -107,9 +107,9 @@ def fit(
     """Estimate materials and initial velocities of objects from a tracked motion, or from films: SCENE.ply and TRACK.h5
     or FILM.mp4... -> MATERIALS.json.
 
-    Films are of fixed cameras that the scene has, and named as these: camera03.mp4, or IMG_3.mp4 of a photo IMG_3.jpg.
-    They start with the scene, and have one frame rate; those of `ngff reconstruct CAMERAS/ --sequence` start when the
-    scene says. Several films are better than one, which hardly shows how far away a thing is.
+    Films must be from fixed cameras of the scene, and named as these: camera03.mp4, or IMG_3.mp4 for a photo IMG_3.jpg.
+    They must start with the state of the scene and have the same frame rate; for a scene of `ngff reconstruct
+    CAMERAS/ --sequence` the start is stored in the scene. Several films are better than one, which hardly shows depth.
     """
     from stages.lab.fit.fit import run
 
@@ -178,7 +178,7 @@ app.add_typer(bench.app, name="bench")
 
 
 def main() -> None:
-    """Run the command that this process was started with."""
+    """Run the command in this process's arguments."""
     run_command_line(app)
 
 

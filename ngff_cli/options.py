@@ -1,4 +1,4 @@
-"""Shared by both command lines: option types, --json, logging and error reports."""
+"""Common parts of both command lines: option types, --json, logging and error reports."""
 
 import errno
 import gc
@@ -24,22 +24,22 @@ from stages.core.errors import InputError
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda | cuda:N")]
 Threads = Annotated[int | None, typer.Option(
-    help="CPU threads; default: all cores. With OMP_WAIT_POLICY=ACTIVE in the environment waiting threads spin: faster "
-         "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
+    help="number of CPU threads; default: all cores. With the environment variable OMP_WAIT_POLICY=ACTIVE waiting "
+         "threads spin: faster on an idle machine, slower on a busy one", show_default=False)]  # fmt: skip
 
 Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
-OutKept = Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")]
+OutKept = Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing results are kept")]
 OutWithTable = Annotated[
-    Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
+    Path, typer.Option("-o", "--out", help="results (.json); existing results are kept; also writes a table (.md)")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("--quality", "--resolution", "--keypoints", "--max-objects", "--batch", "--views", "--side", "--size",
-                "--particles", "--scenes")  # that determine a command's memory, the most effective first  # fmt: skip
+                "--particles", "--scenes")  # options that determine memory, most effective first  # fmt: skip
 INTERRUPTED = "interrupted; no incomplete file is left"
 OUT_OF_MEMORY = "{} is out of memory: close other programs that use it"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
-NEW_OBJECTS = 20_000  # of Python, at which it looks for garbage; its own 700 take 2 to 5 % of a command
+NEW_OBJECTS = 20_000  # threshold of the garbage collector; Python's default of 700 costs 2 to 5 % of a command's time
 
 
 class StderrHandler(logging.Handler):
@@ -51,9 +51,10 @@ class StderrHandler(logging.Handler):
 
 
 def with_options(command: Callable) -> Callable:
-    """The command as typer sees it, with an option for each `option` field of the option classes among its parameters.
+    """Decorate a command for typer: each `option` field of the option classes among its parameters becomes an option.
 
-    It is called with objects of these classes; a field that several of them have is one option, of the first.
+    The command is called with objects of these classes. A field that several classes have becomes one option, that of
+    the first class.
     """
     hints = get_type_hints(command, include_extras=True)
     classes = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
@@ -81,13 +82,16 @@ def with_options(command: Callable) -> Callable:
 
 
 def _check_number(name: str, value: Any) -> None:
-    """InputError for NaN, which passes comparisons, and for integers beyond 64 bits; ranges are for option classes."""
+    """Raise InputError for NaN, which would pass range checks, and for integers beyond 64 bits.
+
+    Option classes check ranges.
+    """
     if isinstance(value, float) and math.isnan(value) or isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise InputError(f"--{name.replace('_', '-')} {value}: give {'a' if value != value else 'a smaller'} number")
 
 
 def _parameter(field: Field, kind: type) -> Parameter:
-    """The parameter that typer makes an option of a field of this type from."""
+    """The parameter from which typer makes an option, for a field of this type."""
     words = dict(field.metadata)
     flags = words.pop("flags")
     if kind is bool and field.default is False and not flags:
@@ -99,51 +103,51 @@ def _parameter(field: Field, kind: type) -> Parameter:
 
 
 def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
-    """Run the command that `words`, by default those of this process, name. Does not return.
+    """Run the command in `words`, by default the arguments of this process. Does not return.
 
-    SIGTERM ends it as Ctrl-C does, without temporary files.
+    SIGTERM ends it like Ctrl-C, without leaving temporary files.
     """
     signal.signal(signal.SIGTERM, interrupt)
-    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may have it ignored
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # not if a shell made the process ignore it
         signal.signal(signal.SIGINT, interrupt)
     gc.set_threshold(NEW_OBJECTS)
     _replace_closed_streams()
     try:
         app(words)
-    except KeyboardInterrupt:  # before the command has begun
+    except KeyboardInterrupt:  # before the command began
         fail(INTERRUPTED, 130)
-    except Exception as error:  # as well
+    except Exception as error:  # before the command began
         if _is_out_of_memory(error):
             fail(OUT_OF_MEMORY.format("the machine"), 1)
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # from --help
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # while printing --help
             fail(f"standard output: {error.strerror}", 2)
         raise
     finally:
-        gc.freeze()  # else Python searches the objects of all modules for garbage as it ends, for most of a second
+        gc.freeze()  # otherwise Python collects the objects of all modules at exit, which takes most of a second
 
 
 def _replace_closed_streams() -> None:
-    """Open the null device for each standard stream that the caller has closed, as `2>&-` does in a shell.
+    """Open the null device for each standard stream that the caller has closed, such as by `2>&-` in a shell.
 
-    A file opened later would get its number, and whatever libraries report there would be written into that file.
+    Otherwise a file opened later would get its descriptor, and messages of libraries would be written into that file.
     """
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # os.open takes the lowest free number
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # os.open takes the lowest free descriptor
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def interrupt(number: int, frame) -> None:
-    """Signal handler: raises KeyboardInterrupt, during an import or a write by HDF5 10 ms later.
+    """Signal handler that raises KeyboardInterrupt; during an import or a write by HDF5, it retries 10 ms later.
 
     In the import system the exception could be lost with a lock held, which blocks all threads that import (CPython's
-    _get_module_lock), and a library that is interrupted while it is imported may report that it is not installed. HDF5
-    loses exceptions of the file object that it writes to, and with them what was to be written.
+    _get_module_lock), and a library that is interrupted during its import may report that it is not installed. HDF5
+    loses exceptions of the file object to which it writes, and with them the data.
     """
     while frame is not None and not (
         frame.f_code.co_filename.startswith("<frozen importlib")
         or frame.f_code.co_filename.endswith("error_deferring_file.py")
     ):
-        # a script may run the command while it is imported itself
+        # the command may run during the import of a script: frames outside the command do not count
         frame = None if frame.f_code is run_command_line.__code__ else frame.f_back
     if frame is None:
         raise KeyboardInterrupt
@@ -153,14 +157,14 @@ def interrupt(number: int, frame) -> None:
 
 
 def set_up(threads: int | None, verbose: bool = False) -> None:
-    """Send log messages, with `verbose` also for debugging, to stderr; use at most `threads` CPU threads, None: all.
+    """Set up logging to stderr, with debug messages if `verbose`, and limit CPU threads to `threads` (None: all cores).
 
-    PyTorch, OpenMP and our own kernels read the number when they are first imported, which no command has done yet.
-    Raises InputError if it is below 1.
+    PyTorch, OpenMP and our own kernels read the number of threads when they are first imported, so this must be called
+    before. Raises InputError if the number is below 1.
     """
-    if hasattr(sys.stdout, "reconfigure"):  # paths that are not UTF-8 are printed as they are
+    if hasattr(sys.stdout, "reconfigure"):  # print paths that are not UTF-8 unchanged
         sys.stdout.reconfigure(errors="surrogateescape")
-    if not sys.stderr.isatty():  # in a log file a progress line every 10 s is enough
+    if not sys.stderr.isatty():  # in a log file, a progress line every 10 s is sufficient
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     logging.basicConfig(handlers=[StderrHandler()], format="%(message)s", level=logging.WARNING, force=True)
     for name in ("stages", "ngff_cli"):
@@ -179,9 +183,9 @@ def new_app() -> typer.Typer:
 
 
 def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None, as_json: bool) -> None:
-    """Print the table lines of `run(out)`, or with --json the JSON file that it writes to `out`.
+    """Print the table lines of `run(out)` or, with --json, the JSON file that it writes.
 
-    `out` is the path of that file, if requested; with --json the table lines go to stderr as progress.
+    `out` is the requested path of that file, if any. With --json the table lines go to stderr as progress.
     """
     if not as_json:
         for line in run(out):
@@ -199,7 +203,7 @@ def add_benchmark(
 ) -> None:
     """Add the command `name` that prints the results of `run`, a "module:function" of (path, options).
 
-    `out` is the type of its option --out, of this default.
+    `out` and `default` are type and default of its option --out.
     """
 
     def benchmark(*, options, out=default, as_json=False) -> None:
@@ -211,9 +215,9 @@ def add_benchmark(
 
 
 class CommandGroup(typer.core.TyperGroup):
-    """Commands in the order of their definition.
+    """A group of commands, listed in the order of their definition.
 
-    An InputError or OSError exits with one line and status 2, exhausted memory with one line and status 1.
+    InputError and OSError exit with one line and status 2; running out of memory, with one line and status 1.
     """
 
     def list_commands(self, ctx) -> list[str]:
@@ -221,14 +225,14 @@ class CommandGroup(typer.core.TyperGroup):
         return list(self.commands)
 
     def get_command(self, ctx, cmd_name: str):
-        """The command; --help of the group lists it with its whole first paragraph instead of 45 characters."""
+        """The command, with its whole first paragraph as help in the group's list instead of 45 characters."""
         command = super().get_command(ctx, cmd_name)
         if command is not None and not command.short_help:
             command.short_help = (command.help or "").split("\n\n")[0]
         return command
 
     def resolve_command(self, ctx, args):
-        """The command that is to run, which refuses empty paths: as a Path they are the current folder."""
+        """The command to run; it rejects empty paths, which Path would convert to the current folder."""
         name, command, rest = super().resolve_command(ctx, args)
         kinds = get_type_hints(command.callback) if command is not None and command.callback else {}
         for parameter in command.params if kinds else []:
@@ -237,7 +241,7 @@ class CommandGroup(typer.core.TyperGroup):
         return name, command, rest
 
     def invoke(self, ctx):
-        """Run the command; turn errors that a user can correct into one line on stderr."""
+        """Run the command; report errors that a user can correct as one line on stderr."""
         try:
             return super().invoke(ctx)
         except InputError as error:
@@ -247,7 +251,7 @@ class CommandGroup(typer.core.TyperGroup):
         except KeyboardInterrupt:
             fail(INTERRUPTED, 130)
         except Exception as error:
-            command = self.commands.get(ctx.invoked_subcommand, self)  # not one that does not exist
+            command = self.commands.get(ctx.invoked_subcommand, self)  # the group, if there is no such command
             if _is_gpu_out_of_memory(error):
                 fail(_less_memory("the GPU", command, ["use --device cpu"]), 1)
             if _is_out_of_memory(error):
@@ -259,7 +263,7 @@ class CommandGroup(typer.core.TyperGroup):
 
 
 def _path_of(parameter, ctx, value):
-    """The value of a parameter whose type is Path, or the values of one that is repeatable."""
+    """Process the value of a parameter of type Path, or the values of a repeatable one. Raises InputError if empty."""
     if "" in (value if isinstance(value, (list, tuple)) else [value]):
         name = parameter.metavar if parameter.param_type_name == "argument" else parameter.opts[-1]
         raise InputError(f"{name}: the path is empty; give the path of a file or folder, or . for the current folder")
@@ -268,7 +272,7 @@ def _path_of(parameter, ctx, value):
 
 def _is_gpu_out_of_memory(error: Exception) -> bool:
     """Whether PyTorch, CUDA or Warp failed to allocate memory on a GPU."""
-    torch = sys.modules.get("torch")  # not imported for this: that takes a second
+    torch = sys.modules.get("torch")  # without importing it, which takes a second
     if torch is not None and isinstance(error, torch.cuda.OutOfMemoryError):
         return True
     text = str(error)
@@ -276,14 +280,14 @@ def _is_gpu_out_of_memory(error: Exception) -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Whether an allocation failed in Python, NumPy, PyTorch, OpenCV, the start of a thread or the loader."""
+    """Whether an allocation failed in Python, NumPy, PyTorch, OpenCV, a thread's start or the dynamic loader."""
     known = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
     known = known or any(text in str(error) for text in NO_MEMORY)
     return known or isinstance(error.__cause__, Exception) and _is_out_of_memory(error.__cause__)
 
 
 def _less_memory(what: str, command, remedies: list[str]) -> str:
-    """Sentence for a command that ran out of memory: which of its options to lower, and what else helps."""
+    """Message for a command that ran out of memory: which of its options to lower, and other remedies."""
     options = {option for parameter in command.params for option in parameter.opts}
     sizes = [option for option in SIZE_OPTIONS if option in options]
     lower = [f"lower {' or '.join(sizes)}"] if sizes else []
@@ -292,9 +296,9 @@ def _less_memory(what: str, command, remedies: list[str]) -> str:
 
 
 def fail(message: str, status: int) -> None:
-    """Exit with one line on stderr, below the progress bars that the error left open."""
+    """Exit with one line on stderr, after closing the progress bars that the error left open."""
     if "tqdm" in sys.modules:
         for bar in list(sys.modules["tqdm"].tqdm._instances):
             bar.close()
-    print("ngff: " + re.sub(r"[\x00-\x1f\x7f]", "?", message), file=sys.stderr)  # what a user gave may have several
+    print("ngff: " + re.sub(r"[\x00-\x1f\x7f]", "?", message), file=sys.stderr)  # file names may contain line breaks
     sys.exit(status)

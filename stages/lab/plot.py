@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.core.scene.files import replacing
 
-PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 460, 300, 52  # of a panel [px]
+PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 460, 300, 52  # size of a panel, and width of its border for labels [px]
 INK, BLUE, RED, GRID = (40, 40, 40), (176, 92, 20), (40, 40, 200), (225, 225, 225)  # BGR
 COLOURS = (
     (40, 40, 200),
@@ -25,25 +25,25 @@ COLOURS = (
     (110, 110, 110),
     (34, 189, 188),
     (207, 190, 23),
-)  # of curves, BGR
-LEGEND_HEIGHT = 20  # height of a line of the legend [px]
+)  # line colours of curves, BGR
+LEGEND_HEIGHT = 20  # height of one line of the legend [px]
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot, left blank without points. With `log` both axes are logarithmic and points must be positive."""
+    """One plot; blank if it has no points. With `log`, both axes are logarithmic and coordinates must be positive."""
 
     title: str
     measured: Points = ()
     expected: Points = ()
     log: bool = False
-    theory: str = "theory"  # label of the line
-    curves: Mapping[str, Points] = field(default_factory=dict)  # curves of one name have one colour in all panels
+    theory: str = "theory"  # label of the line through `expected`
+    curves: Mapping[str, Points] = field(default_factory=dict)  # a name has the same colour in all panels
 
 
 def draw_panels(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
-    """Write panels in rows of `columns` as a PNG, with a legend of the curves below; InputError if not writable."""
+    """Write the panels as a PNG, in rows of `columns`, with a legend below. Raises InputError if it is not writable."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
     rows = [list(panels[i : i + columns]) for i in range(0, len(panels), columns)]
@@ -57,7 +57,7 @@ def draw_panels(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
 
 
 def _legend(colours: Mapping[str, tuple[int, int, int]], width: int) -> np.ndarray:
-    """Legend of the curves, in as many lines as needed."""
+    """Legend of the curves, wrapped into as many lines as needed."""
     lines, x = [np.full((LEGEND_HEIGHT, width, 3), 255, np.uint8)], MARGIN
     for name, colour in colours.items():
         if x > MARGIN and x + 40 + 8 * len(name) > width:
@@ -115,7 +115,7 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
 
 
 def _ticks(low: float, high: float, log: bool) -> list[float]:
-    """A few round numbers between the ends; on a logarithmic axis powers of ten, with multiples 2 and 5 if few."""
+    """A few round numbers between the ends; on a log axis powers of ten, with multiples 2 and 5 if those are few."""
     if log:
         decades = range(math.floor(low), math.ceil(high) + 1)
         marks = [d + math.log10(m) for d in decades for m in ((1, 2, 5) if high - low < 2 else (1,))]

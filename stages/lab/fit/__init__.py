@@ -1,1 +1,1 @@
-"""Materials and start velocities of objects from a tracked motion."""
+"""Fitting of material parameters and initial velocities of objects to an observed motion."""

@@ -1,4 +1,4 @@
-"""A track in another frame of reference than the scene, brought into that of the scene."""
+"""Conversion of a track to the frame of reference of a scene."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ log = logging.getLogger(__name__)
 
 
 def aligned(track: Trajectory, scene: Scene, file: Path) -> Trajectory:
-    """The track with positions, gravity and ids of objects as the scene of a file has them.
+    """The track with the positions, gravity and object ids expressed in the frame of the scene read from `file`.
 
-    Cameras and objects are matched as by `ngff evaluate --align`. Raises InputError where they cannot be, and for a
-    track with forces, pins or lifts, which are in the frame of the track.
+    Cameras and objects are matched as by `ngff evaluate --align`. Raises InputError if they do not match, or if the
+    track has forces, pins or lifts, since these are given in the frame of the track.
     """
     prompts = read_prompts_file(track.path, file.stem, track.scene.objects)
-    if replace(prompts, velocity={}):  # which is fitted
+    if replace(prompts, velocity={}):  # velocities are ignored: they are fitted
         raise InputError(f"{track.path}: it has prompts, whose objects and directions are not those of {file}; fit the "
                          "scene that they are about, without --align")  # fmt: skip
     predicted, true = scene_reference_frame(file, scene), trajectory_reference_frame(track)

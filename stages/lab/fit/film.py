@@ -1,8 +1,8 @@
-"""The fit of films: the motion for given parameters as their cameras would see it, and how far their pictures differ.
+"""Fitting to films: render the motion for given parameters from the film cameras and compare it with the images.
 
-Objects are first followed through the films, as `ngff-lab track` does: this is the track on which the search starts.
-Then pictures are compared, in the pixels around where the moving objects were followed to, by Geman and McClure's
-function, so that what the scene does not explain (a shadow, a hand) has little effect.
+The objects are first tracked through the films, as `ngff-lab track` does; the search starts by fitting this track. Then
+images are compared in the pixels around the tracked positions of the moving objects. Residuals use the Geman-McClure
+function, so that image content that the scene does not explain (a shadow, a hand) has little effect.
 """
 
 from __future__ import annotations
@@ -41,47 +41,48 @@ from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 from stages.lab.track.track import GRAVITY, check_objects, report, rows_of
 
 log = logging.getLogger(__name__)
-PICTURES = 24  # of each film that are compared, evenly spread over the motion
-REDUCTIONS = (4, 2)  # of the pictures that are compared, coarse to fine: those at which poses were fitted
-MARGIN = 2  # of the pixels compared around an object [reduced px]: poses were fitted to a fraction of a pixel
-# pixels, before they are reduced, that count as one observation: residuals of true motions are correlated over 50 to 75
-# of them (`ngff-lab bench fit-films`, seeds 100 to 102)
+PICTURES = 24  # images of each film that are compared, evenly spread over the motion
+REDUCTIONS = (4, 2)  # reductions of the compared images, coarse to fine; poses were tracked at the same ones
+MARGIN = 2  # width of the compared border around an object [reduced px]; tracked poses are accurate to less than 1 px
+# Pixels, before reduction, that count as one independent observation: residuals of the true motion are correlated over
+# 50 to 75 pixels (`ngff-lab bench fit-films`, seeds 100 to 102).
 BLOCK = 64
-CLEARLY = 0.5  # difference of pictures to renderings with an object, of that without it, up to which they show it
-FOLLOWED = 0.5  # error of the track up to which the search goes on [px]: pictures tell what is nearer
+CLEARLY = 0.5  # an image shows an object if it differs from a rendering with it by less than this times that without it
+FOLLOWED = 0.5  # error below which the track is not fitted any closer [px]; images decide what is nearer
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a film, and the pixels of it that are compared."""
+    """An image of a film, and the mask of the pixels that are compared."""
 
-    film: int  # its number
+    film: int  # index of the film
     time: float  # since the first frame [frames]
-    image: Float[Tensor, "h w 3"]  # at the brightness of the scene
+    image: Float[Tensor, "h w 3"]  # scaled to the brightness of the scene
     window: Bool[Tensor, "h w"]
 
 
 @dataclass(frozen=True)
 class FilmProblem(Problem):
-    """A scene and films of it; `track` is its motion as it was followed through them."""
+    """A scene and films of it; `track` is the motion that was tracked through the films."""
 
-    cameras: tuple[Camera, ...]  # of the films
-    skinning: Skinning  # of the Gaussians of the objects
+    cameras: tuple[Camera, ...]  # one per film
+    skinning: Skinning  # moves the Gaussians of the objects with the keypoints
     pictures: tuple[Picture, ...]
-    scale: float  # of the residuals of pixels, above which they have less and less weight [colours from 0 to 1]
-    reduction: int  # of the pictures
+    scale: float  # scale of the Geman-McClure function: larger residuals lose weight [colours from 0 to 1]
+    reduction: int  # of the images
 
     unit = "colours from 0 to 1"  # of `rmse`
-    noise_margin = 1.02  # mean squares of true motions were at most 1.008 of those of tracks (bench, seeds 100 to 102)
+    # the mean square of true motions was at most 1.008 times that of tracks (bench, seeds 100 to 102)
+    noise_margin = 1.02
 
     @property
     def tracked(self) -> Problem:
-        """The fit of the track."""
+        """The problem of fitting the track alone."""
         return Problem(**{f.name: getattr(self, f.name) for f in fields(Problem)})
 
     @property
     def levels(self) -> list[FilmProblem]:
-        """The problem with coarse to fine pictures; the last is this one."""
+        """The same problem with coarse to fine images; the last is this one."""
         return [*(self.coarser(r // self.reduction) for r in REDUCTIONS[:-1]), self]
 
     @property
@@ -95,13 +96,13 @@ class FilmProblem(Problem):
 
     @property
     def noise_level(self) -> float:
-        """Root mean square of the residuals of the track, whose poses are free of any engine."""
+        """Root mean square of the residuals at the tracked poses, which do not depend on an engine."""
         return self.mean_square(self.residuals(self.track)) ** 0.5
 
     def residuals(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
-        """Robust differences of all pixels [scales], nan where the motion diverges.
+        """Geman-McClure residuals of all pixels [scales], nan where the motion diverges.
 
-        They are scaled so that a block of pixels has the weight of one: those of neighbours are not independent.
+        They are scaled such that a block of pixels has the weight of one, since neighbouring pixels are correlated.
         """
         if not motion.isfinite().all():
             return np.full(3 * sum(int(p.window.sum()) for p in self.pictures), np.nan)
@@ -116,16 +117,16 @@ class FilmProblem(Problem):
         return (reduced(image, self.reduction) - picture.image)[picture.window] / self.scale
 
     def mean_square(self, residuals: np.ndarray) -> float:
-        """Of the robust difference of a channel [scales^2]."""
+        """Mean square of the robust residual of a colour channel [scales^2]."""
         return float(np.square(residuals).sum()) / self.observations
 
     def cost(self, residuals: np.ndarray) -> float:
-        """Mean of Geman and McClure's function over the pictures."""
+        """Mean of the Geman-McClure function over all images."""
         cost = self.mean_square(residuals)
         return cost if np.isfinite(cost) else FAILED
 
     def rmse(self, residuals: np.ndarray) -> float:
-        """Root mean square of the robust differences of colours, of 0 to 1."""
+        """Root mean square of the robust colour residuals [colours from 0 to 1]."""
         return self.scale * self.mean_square(residuals) ** 0.5
 
     def first_frames(self, frames: int) -> FilmProblem:
@@ -134,7 +135,7 @@ class FilmProblem(Problem):
         return replace(part, pictures=tuple(p for p in self.pictures if p.time <= frames - 1))
 
     def coarser(self, factor: int) -> FilmProblem:
-        """The same problem with pictures that are further reduced by a whole factor."""
+        """The same problem with images reduced further by an integer factor."""
         coarse = [replace(p, image=reduced(p.image, factor), window=_shrunk(p.window, factor)) for p in self.pictures]
         return replace(self, pictures=tuple(coarse), reduction=factor * self.reduction)
 
@@ -144,21 +145,22 @@ def _shrunk(window: Bool[Tensor, "h w"], factor: int) -> Bool[Tensor, "h2 w2"]:
 
 
 def robust(difference: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
-    """Differences [scales] whose squares are Geman and McClure's function of them."""
+    """Differences [scales] rescaled such that their squares equal the Geman-McClure function of the original."""
     return difference / (1 + difference.square().mean(1, keepdim=True)).sqrt()
 
 
 def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOptions) -> FilmProblem:
-    """Follow the objects of a scene through films of its cameras, and pose the problem of these films.
+    """Track the objects of a scene through films of its cameras, and set up the problem of fitting these films.
 
-    Films are named as their cameras. Those of a scene that `ngff reconstruct --sequence` made start when it says,
-    others with the scene. Raises InputError for films that do not fit the scene or each other.
+    Each film is named after its camera. For a scene made by `ngff reconstruct --sequence`, films start at the times
+    recorded in the scene; otherwise at the state of the scene. Raises InputError for films that do not match the scene
+    or each other.
     """
     world = read_scene(scene)
     check_objects(world, scene)
-    options = replace(options, rest=False)  # films begin as objects are released
+    options = replace(options, rest=False)  # films start when the objects are released
     recordings = by_camera(world, scene, films)
-    timed = world.sequence is None  # otherwise starts are estimates, which are corrected
+    timed = world.sequence is None  # recorded starts are estimates, which tracking corrects
     world = replace(world, sequence=timing(world, scene, recordings, options.frames))
     cameras, read = read_films(world, recordings, world.sequence.frames, options.resolution)
     frames = min(world.sequence.frames, max(int(len(film.frames) - film.start) for film in read))
@@ -178,7 +180,7 @@ def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOp
 
 
 def shown(tracker: Tracker) -> Bool[Tensor, "o"]:
-    """Which objects the first pictures show where the scene has them: clearly nearer to its renderings than without."""
+    """Which objects are visible at their positions in the scene: rendering them fits the first images much better."""
     with_it, without_it = [], []
     gone = without(tracker.rest, torch.ones(len(tracker.rest.centre), dtype=torch.bool, device=tracker.device))
     for o in tracker.observe(0, REDUCTIONS[-1], tracker.still, tracker.still):
@@ -191,9 +193,9 @@ def shown(tracker: Tracker) -> Bool[Tensor, "o"]:
 
 
 def by_camera(world: Scene, scene: Path, films: Sequence[Path]) -> dict[str, Path]:
-    """The films by the camera of the scene whose name they have, but for the suffix.
+    """The films by the name of the scene camera that they are named after, ignoring suffixes.
 
-    Raises InputError for films of no camera, and of one that has another film.
+    Raises InputError for a film that matches no camera, and for two films of one camera.
     """
     if world.cameras is None:
         raise InputError(f"{scene}: has no cameras, so that films of it cannot be compared; fit a track of its motion")
@@ -212,7 +214,7 @@ def by_camera(world: Scene, scene: Path, films: Sequence[Path]) -> dict[str, Pat
 def timing(world: Scene, scene: Path, recordings: dict[str, Path], frames: int) -> FilmedSequence:
     """When the films start, their frame rate, and the number of frames to compare (0: all).
 
-    Raises InputError for other frame rates than that of the scene's films, and for films that start at unknown times.
+    Raises InputError if the frame rate differs from that of the scene's films, or if the start of a film is unknown.
     """
     for path in recordings.values():
         must_exist(path, "a video")
@@ -232,9 +234,9 @@ def timing(world: Scene, scene: Path, recordings: dict[str, Path], frames: int) 
 def film_problem(
     world: Scene, tracker: Tracker, track: TrackedMotion, info: SimulationInfo, options: MaterialFitOptions, where: str
 ) -> FilmProblem:
-    """The problem of films through which the objects of a scene were followed.
+    """Set up the problem for films through which the objects of a scene were tracked.
 
-    Raises InputError where nothing moves.
+    Raises InputError if nothing moves.
     """
     keypoints = choose_keypoints(world, options.keypoints, options.seed)
     row, poses = rows_of(world, keypoints), track.poses.to("cpu")
@@ -242,7 +244,7 @@ def film_problem(
     motion = Trajectory(world, info, keypoints, bind_gaussians(world, keypoints), positions, poses.centre,
                         poses.quaternions(), Path(where))  # fmt: skip
     posed = pose_problem(world, motion, ForcePrompts(), options, where)
-    synthesiser = Synthesiser(world, "cpu")  # for processes of which each draws its own pictures
+    synthesiser = Synthesiser(world, "cpu")  # on the CPU, since each worker process renders its own images
     objects = replace(world, gaussians=synthesiser.rest_gaussians)
     moving = [i for i, o in enumerate(world.objects) if o.id in posed.moving]
     posed = replace(posed, noise=max(posed.noise, FOLLOWED * pixel(tracker, moving)))
@@ -256,13 +258,13 @@ def film_problem(
 
 
 def pixel(tracker: Tracker, rows: Sequence[int]) -> float:
-    """The smallest size of a pixel at the middle of one of the objects in its first place [scene units]."""
+    """The smallest size of a pixel at the centre of any of the objects in its initial position [scene units]."""
     middle = tracker.rest.centre[rows]
     return min(float((depths(middle, c.viewmat) / c.K[0, 0]).abs().min()) for c in tracker.cameras)
 
 
 def pictures(tracker: Tracker, track: TrackedMotion, moving: Sequence[int]) -> Iterable[Picture]:
-    """Some pictures of each film that show moving objects which were followed."""
+    """PICTURES evenly spread images of each film that show moving objects which were not lost."""
     every = list(_all_pictures(tracker, track, moving))
     for film in range(len(tracker.films)):
         shown = [p for p in every if p.film == film]

@@ -35,7 +35,7 @@ from stages.lab.fit.search import (
 from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
-PROBABLE = 1.0  # squared distance of initial values from an estimate up to which they are kept [its covariance]
+PROBABLE = 1.0  # squared Mahalanobis distance from the estimate up to which initial values are kept
 
 
 @dataclass(frozen=True)
@@ -44,23 +44,23 @@ class Fit:
 
     problem: Problem
     found: Estimate  # the most probable point
-    accepted: np.ndarray  # the same, with initial values of what the motion does not determine [ranges]
-    rmse: tuple[float, float]  # of the motion before and after [unit of the problem]
+    accepted: np.ndarray  # the same, with initial values where the motion does not determine a parameter [ranges]
+    rmse: tuple[float, float]  # of the motion, before and after the fit [unit of the problem]
     evaluations: int
     seconds: float
-    determined: bool = True  # whether intervals were found before the time ended
+    determined: bool = True  # whether intervals were computed before the time ran out
 
     @property
     def half(self) -> np.ndarray:
-        """Half widths of 95 % intervals [ranges], infinite where they were not determined."""
+        """Half widths of the 95 % intervals [ranges]; infinite if the intervals were not determined."""
         return 1.96 * self.found.deviations if self.determined else np.full(len(self.found.x), np.inf)
 
     def value(self, k: int) -> float:
-        """Of the k-th parameter; log10 of it where it is searched so."""
+        """Value of the k-th parameter; its log10 if the search is logarithmic."""
         return self.problem.parameters[k].value(float(self.found.x[k]))
 
     def half_width(self, k: int) -> float | None:
-        """Of its 95 % interval; None where that was not determined."""
+        """Half width of the 95 % interval of the k-th parameter; None if it was not determined."""
         p = self.problem.parameters[k]
         return float(self.half[k]) * (p.high - p.low) if self.determined else None
 
@@ -71,9 +71,9 @@ class Fit:
 
 
 def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOptions) -> list[str]:
-    """Write OUT for `ngff simulate --materials OUT`, and OUT's name with .fit.json with intervals; lines of text.
+    """Write OUT for `ngff simulate --materials OUT`, and intervals to OUT with the suffix .fit.json; return a summary.
 
-    `motion` is one trajectory, or films. Raises InputError for a motion that is not of the scene, and MissingPackage
+    `motion` is one trajectory, or films. Raises InputError if the motion does not match the scene, and MissingPackage
     without the package cma.
     """
     until = time.perf_counter() + 60 * options.minutes
@@ -106,8 +106,9 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
 def solve(problem: Problem, options: MaterialFitOptions, until: float | None = None) -> Fit:
     """Search for the parameters, and estimate how accurately the motion determines them.
 
-    Films are compared from the fit of the track on, which was followed through them. No simulation begins after
-    `until`, a time of `time.perf_counter` (by default --minutes from now), but those of the outcome.
+    The track is fitted first. For films, which were tracked to obtain it, images are compared from that result on. No
+    simulation starts after `until`, a time of `time.perf_counter` (default: --minutes from now), except the two that
+    measure the outcome.
     """
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
@@ -127,7 +128,7 @@ def solve(problem: Problem, options: MaterialFitOptions, until: float | None = N
 
 
 def _kept(problem: Problem, left: float) -> float:
-    """Time kept for the pictures of films, as one simulation tells, but no more than half of what is left [s]."""
+    """Time reserved for comparing images, based on timing one simulation, at most half of the remaining time [s]."""
     if not problem.levels or left <= 0:
         return 0.0
     begun, parameters = time.perf_counter(), problem.parameters
@@ -137,7 +138,7 @@ def _kept(problem: Problem, left: float) -> float:
 
 
 def _settled(sims: Simulations, found: Estimate) -> Fit:
-    """The fit near an estimate, with its uncertainty if there is time for it."""
+    """The fit refined from an estimate, with its uncertainty if time permits."""
     problem, frames, determined = sims.problem, len(sims.problem.track), False
     sims.reserved = OUTCOME
     with suppress(OutOfTime):
@@ -154,9 +155,10 @@ def _settled(sims: Simulations, found: Estimate) -> Fit:
 
 
 def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> np.ndarray:
-    """The estimate's point, with initial values of those `unknown` parameters that are probable to have them.
+    """The estimate's point, with `unknown` parameters reset to their initial values where those are probable.
 
-    The others take their most probable values for these. Parameters that only act together keep what is known of both.
+    The other parameters take their most probable values given the reset ones, so that the joint effect of parameters
+    that only act together is preserved.
     """
     covariance, accepted = found.root @ found.root.T, found.x
     reset: list[int] = []
@@ -171,7 +173,7 @@ def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> 
 
 
 def describe(fit: Fit) -> list[str]:
-    """A line about each object, and about the whole."""
+    """One line for each object, and one for the whole fit."""
     names = {o.id: o.name for o in fit.problem.scene.objects}
     lines = []
     for i in fit.problem.moving:
@@ -200,7 +202,7 @@ def _text(fit: Fit, k: int, p: Parameter) -> str:
 
 
 def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:
-    """The command that repeats the motion."""
+    """The command line that reproduces the motion."""
     options = fit.problem.options
     contact, rest = ["--contact learned"] * (options.engine == "ngff"), ["--no-rest"] * (not options.rest)
     gravity = [f"--gravity {options.gravity:.4g}"] * (f"{options.gravity:.4g}" != f"{SimulateOptions.gravity:.4g}")

@@ -1,4 +1,4 @@
-"""The parameters of a fit: quantities of objects, their ranges, and how they become materials and velocities."""
+"""Parameters of a fit: material quantities and velocities with their ranges, and conversion from search coordinates."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from stages.core.physics.materials import Material
 
 @dataclass(frozen=True)
 class Quantity:
-    """A material constant as a search parameter: its range, and the accuracy from which it counts as identifiable."""
+    """A material constant as a search parameter: its range, and the accuracy required to call it identifiable."""
 
     low: float
     high: float
-    max_half_width: float  # of a 95 % interval, up to which the value is used
-    log: bool = False  # the range and the interval are of log10
-    relative: bool = False  # the range is that of the ratio to the material that the search starts from
+    max_half_width: float  # largest half width of the 95 % interval of an identifiable value
+    log: bool = False  # range and interval are in log10
+    relative: bool = False  # the range is that of the ratio to the initial material
     what: str = ""
 
 
@@ -27,34 +27,34 @@ QUANTITIES: Mapping[str, Quantity] = {
     "density": Quantity(-1.0, 1.0, 0.15, log=True, relative=True, what="density over that of the first object"),
     "E": Quantity(3.0, 8.0, 0.5, log=True, what="Young's modulus [Pa]"),
 }
-RIGID = ("friction", "loss", "density")  # quantities that act on rigid motion; others are not identifiable from it
+RIGID = ("friction", "loss", "density")  # quantities that affect rigid motion; it does not identify any others
 AXES = "xyz"
-SPEED_RANGE = 1.0  # about the speed that the first frames suggest [scene units/s]
-STEP, SPEED_STEP = 0.25, 0.1  # first standard deviations of the search, in ranges
+SPEED_RANGE = 1.0  # half width of the search range about the velocity guessed from the first frames [scene units/s]
+STEP, SPEED_STEP = 0.25, 0.1  # initial standard deviations of the search for materials and velocities [ranges]
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One coordinate of the search, from 0 (`low`) to 1 (`high`)."""
+    """One coordinate of the search, scaled from 0 (`low`) to 1 (`high`)."""
 
     object_id: int
     name: str  # key of QUANTITIES, or one of AXES for a velocity
     low: float
     high: float
-    start: float  # value where the search starts
+    start: float  # initial value of the search
     step: float = STEP
 
     def value(self, x: float) -> float:
-        """The value at a coordinate: log10 of it for quantities that are searched so."""
+        """The value at a coordinate; its log10 for quantities with a logarithmic range."""
         return self.low + x * (self.high - self.low)
 
     def coordinate(self, value: float) -> float:
-        """The inverse of `value`, within the range."""
+        """The inverse of `value`, clamped to the range."""
         return min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
 
 
 def material_parameters(object_id: int, material: Material, names: Sequence[str]) -> list[Parameter]:
-    """Parameters of these quantities of an object, which start from a material."""
+    """Parameters for the named quantities of an object, with a material as initial values."""
     parameters = []
     for name in names:
         q, now = QUANTITIES[name], getattr(material, name)
@@ -65,14 +65,14 @@ def material_parameters(object_id: int, material: Material, names: Sequence[str]
 
 
 def velocity_parameters(object_id: int, velocity: Mapping[str, float]) -> list[Parameter]:
-    """Parameters of a start velocity along the given axes, about a guess."""
+    """Parameters for the initial velocity of an object along the given axes, centred on a guess."""
     return [Parameter(object_id, axis, v - SPEED_RANGE, v + SPEED_RANGE, v, SPEED_STEP) for axis, v in velocity.items()]
 
 
 def fitted(
     parameters: Sequence[Parameter], x: Sequence[float], materials: Mapping[int, Material]
 ) -> tuple[dict[int, Material], dict[int, tuple[float, float, float]]]:
-    """Materials and start velocities at a point of the search."""
+    """Materials and initial velocities at a point of the search."""
     found, velocity = dict(materials), {}
     for p, coordinate in zip(parameters, x, strict=True):
         value = p.value(float(coordinate))
@@ -87,7 +87,7 @@ def fitted(
 
 
 def as_json(material: Material) -> dict:
-    """A material as `ngff simulate --materials` reads it."""
+    """A material in the form that `ngff simulate --materials` reads."""
     row = {name: getattr(material, name) for name in ("E", "density", "nu", "friction", "loss")}
     if material.model != Material.model:
         row |= {"model": material.model, "plastic": list(material.plastic)}

@@ -1,4 +1,4 @@
-"""The fit of a track: the motion for given parameters, and its distance from the track."""
+"""Fitting to a track: simulate the motion for given parameters and measure its distance from the track."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from stages.simulate.engine_choice import with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
-TOLERANCE = 0.03  # error above which the cost of a frame grows by its logarithm only [sizes of the object]
+TOLERANCE = 0.03  # error above which the cost of a frame grows only logarithmically [object sizes]
 FAILED = 50.0  # cost of a motion that diverges; larger than any other
-FIRST_FRAMES = 4  # from which start velocities are guessed
-STILL = 0.01  # largest displacement of an object that does not move [sizes of the object]
-MISPLACED = 0.1  # error of the first frame above which a track is of another scene [sizes of the object]
+FIRST_FRAMES = 4  # frames from which initial velocities are guessed
+STILL = 0.01  # largest displacement of an object that counts as not moving [object sizes]
+MISPLACED = 0.1  # error in the first frame above which a track does not belong to the scene [object sizes]
 
 
 @dataclass(frozen=True)
@@ -56,21 +56,21 @@ class Problem:
     track: Float[Tensor, "t k 3"]
     prompts: ForcePrompts
     options: SimulateOptions
-    materials: dict[int, Material]  # where the search starts
+    materials: dict[int, Material]  # initial values, by object id
     parameters: tuple[Parameter, ...]
     noise: float  # standard deviation of a coordinate of the track [scene units]
 
     unit = "scene units"  # of `rmse`
-    noise_margin = 1.1  # on the variance of the track's noise, which is estimated to a tenth
+    noise_margin = 1.1  # factor on the noise variance of the track, which is estimated to within 10 %
 
     @property
     def tracked(self) -> Problem:
-        """The problem on which the search starts."""
+        """The problem to be solved first."""
         return self
 
     @property
     def levels(self) -> Sequence[Problem]:
-        """Problems that are solved from its solution on, in turn."""
+        """Problems to be solved after it, each starting from the previous solution."""
         return ()
 
     @property
@@ -80,11 +80,11 @@ class Problem:
 
     @property
     def moving(self) -> list[int]:
-        """Ids of the objects that are compared: those that have parameters."""
+        """Ids of the objects that are compared, which are those with parameters."""
         return list(dict.fromkeys(p.object_id for p in self.parameters))
 
     def motion(self, x: Sequence[float]) -> Float[Tensor, "t k 3"]:
-        """The keypoints as the engine moves them; nan where the motion diverges."""
+        """The keypoint trajectories simulated by the engine; nan if the motion diverges."""
         materials, velocity = fitted(self.parameters, x, self.materials)
         names = {o.id: o.name for o in self.scene.objects}
         with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +92,7 @@ class Problem:
             file.write_text(json.dumps({str(i): as_json(m) for i, m in materials.items() if i in names}))
             options = replace(self.options, material=(), materials=file)
             prompts = replace(self.prompts, velocity={**self.prompts.velocity, **velocity})
-            logging.disable(logging.WARNING)  # the engine's messages, the same every time
+            logging.disable(logging.WARNING)  # every simulation would repeat the same messages
             try:
                 states = load(ENGINES[options.engine].rollout)(self.scene, self.keypoints, prompts, options)
                 return torch.stack([state.positions for state in states])
@@ -103,13 +103,13 @@ class Problem:
 
     @property
     def tolerance(self) -> Float[Tensor, "o"]:
-        """Error of each moving object that counts as one [scene units]."""
+        """Error that counts as one, for each moving object [scene units]."""
         return TOLERANCE * torch.stack([_size(self.keypoints, i) for i in self.moving])
 
     def residuals(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
-        """Coordinates of the moving objects less those of the track [tolerances], nan where the motion diverges.
+        """Differences between the coordinates of the moving objects and the track [tolerances]; nan if it diverges.
 
-        They are scaled so that an object has the weight of one point in a frame.
+        They are scaled such that an object has the weight of a single point in each frame.
         """
         parts = [(motion - self.track)[:, self.keypoints.object_id == i] for i in self.moving]
         return torch.cat([(part / t / part.shape[1] ** 0.5).flatten()
@@ -122,28 +122,28 @@ class Problem:
         return torch.stack([part.reshape(len(self.track), -1).square().sum(1) for part in parts], 1)
 
     def mean_square(self, residuals: np.ndarray) -> float:
-        """Of a coordinate of a keypoint less that of the track [tolerances^2]."""
+        """Mean square of the difference between a keypoint coordinate and the track [tolerances^2]."""
         return float(self.errors(residuals).mean()) / 3
 
     def rmse(self, residuals: np.ndarray) -> float:
-        """Root mean squared distance of the keypoints from the track [scene units]."""
+        """Root mean square distance of the keypoints from the track [scene units]."""
         return float((self.errors(residuals) * self.tolerance**2).mean()) ** 0.5
 
     @property
     def noise_level(self) -> float:
-        """Standard deviation of a coordinate of the track [tolerances]."""
+        """Standard deviation of the noise of a track coordinate [tolerances]."""
         return self.noise * float(self.tolerance.pow(-2).mean()) ** 0.5
 
     @property
     def noise_cost(self) -> float:
-        """The cost of the track's noise."""
+        """The cost that the noise of the track alone causes."""
         return float(torch.log1p(3 * (self.noise / self.tolerance) ** 2).mean())
 
     def error(self, residuals: np.ndarray) -> float:
-        """Standard deviation of a residual [tolerances] for intervals, from those that remain.
+        """Standard deviation of a residual for computing intervals [tolerances], from the residuals of the best fit.
 
-        Noise is independent from frame to frame. Residuals beyond it are taken as fully correlated: they count as one
-        observation.
+        Noise is independent from frame to frame. Residuals beyond the noise are assumed to be fully correlated and
+        therefore count as one observation.
         """
         noise = self.noise_level**2
         excess = max(0.0, self.mean_square(residuals) - self.noise_margin * noise)
@@ -152,7 +152,7 @@ class Problem:
     def cost(self, residuals: np.ndarray) -> float:
         """Mean of log(1 + squared error / tolerance^2) over frames and objects.
 
-        After a collision motions diverge from each other; the logarithm keeps such frames from outweighing the others.
+        After a collision, trajectories diverge; the logarithm keeps such frames from dominating the cost.
         """
         cost = float(torch.log1p(self.errors(residuals)).mean())
         return cost if math.isfinite(cost) else FAILED
@@ -164,7 +164,7 @@ class Problem:
 
 
 def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Problem:
-    """Pose the problem of a scene file and a trajectory file. Raises InputError where they do not fit each other."""
+    """Set up the problem of a scene file and a trajectory file. Raises InputError if they do not match."""
     truth, world = read_trajectory(track), read_scene(scene)
     if options.align:
         truth = aligned(truth, world, scene)
@@ -175,9 +175,9 @@ def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Probl
 def pose_problem(
     scene: Scene, truth: Trajectory, prompts: ForcePrompts, options: MaterialFitOptions, where: str = "the track"
 ) -> Problem:
-    """The problem of a scene and a track of its objects; `prompts` are its forces, pins and lifts, without velocities.
+    """The problem of a scene and a track of its objects; `prompts` holds its forces, pins and lifts, but no velocities.
 
-    Raises InputError for a track of other objects, or one that does not start where the scene is.
+    Raises InputError if the track has none of the scene's objects, or does not start at their positions in the scene.
     """
     tracked = set(truth.keypoints.object_id.tolist())
     scene = replace(scene, objects=tuple(o for o in scene.objects if o.id in tracked))
@@ -197,7 +197,7 @@ def pose_problem(
     if simulate.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {simulate.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     simulate = with_engine(simulate, scene, choose_keypoints(scene, options.keypoints, options.seed))
-    if simulate.engine == "ngff":  # its solved contacts know no more of a material than those of the rigid engine
+    if simulate.engine == "ngff":  # its solved contacts depend on the same material properties as the rigid engine
         simulate = replace(simulate, contact="learned")
     choices = choose_materials(scene.objects, options.material)
     materials = {i: choice.material for i, choice in choices.items()}
@@ -210,10 +210,10 @@ def pose_problem(
 
 
 def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
-    """Standard deviation of a track's errors, from the median size of its third differences in time.
+    """Standard deviation of a track's errors, from the median magnitude of its third differences in time.
 
-    Those of a smooth motion are nearly zero, and collisions are few; of independent errors of variance 1 they have the
-    variance 1 + 9 + 9 + 1.
+    Third differences of a smooth motion are nearly zero, and collisions are rare. For independent errors of variance 1
+    the third difference has the variance 1 + 9 + 9 + 1.
     """
     if len(track) < 8:
         return 0.0
@@ -223,7 +223,7 @@ def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
 
 
 def _spread(keypoints: Keypoints, object_id: int, options: MaterialFitOptions) -> Tensor:
-    """Rows of at most `options.keypoints` keypoints of an object, far from each other."""
+    """Rows of at most `options.keypoints` keypoints of an object, selected by farthest-point sampling."""
     rows = (keypoints.object_id == object_id).nonzero()[:, 0]
     return rows[farthest_points(keypoints.rest[rows], options.keypoints, options.seed)].sort().values
 
@@ -236,7 +236,7 @@ def _size(keypoints: Keypoints, object_id: int) -> Tensor:
 def _lifts(
     scene: Scene, keypoints: Keypoints, frames: Float[Tensor, "t k 3"], prompts: ForcePrompts, where: str
 ) -> dict[int, float]:
-    """How high above its place in the scene each object starts. Raises InputError for a start elsewhere."""
+    """Height of each object's start above its position in the scene. Raises InputError for other displacements."""
     lifts = dict(prompts.lift)
     for o in scene.objects:
         mine = keypoints.object_id == o.id
@@ -251,9 +251,9 @@ def _lifts(
 
 
 def _parameters(problem: Problem) -> list[Parameter]:
-    """Quantities of the objects that move, and velocities of those that do so from the start.
+    """Material quantities of the objects that move, and initial velocities of those that move from the start.
 
-    Without forces a common factor of all densities changes nothing: the first object's stays.
+    Without forces, scaling all densities by a common factor has no effect, so the first object's density stays fixed.
     """
     parameters: list[Parameter] = []
     names = RIGID if problem.options.engine == "rigid" else tuple(QUANTITIES)
@@ -276,18 +276,18 @@ def _parameters(problem: Problem) -> list[Parameter]:
 
 
 def _first_velocity(problem: Problem, centre: Float[Tensor, "t 3"], still: float, stands: bool) -> dict[str, float]:
-    """A guess of the start velocity of an object by axis [scene units/s], from the first frames of its middle.
+    """Guess the initial velocity of an object by axis [scene units/s] from its centre in the first frames.
 
-    Nothing for one that is released from rest, and no vertical velocity of one that is supported: whose height is
-    constant, or is nearer to that than to free flight, as of one that settles; or which `stands` where it is released
-    from rest and does not hop higher than `still`, since tracks from one camera rise and fall by errors of its depth.
+    Empty for an object released from rest. No vertical velocity for a supported object, that is one whose height is
+    constant or closer to constant than to free flight (as when it settles), or one that `stands` when released from
+    rest and does not hop higher than `still`: in tracks from a single camera, depth errors look like vertical motion.
     """
     unit = problem.scene.metres_per_unit
     first = centre[: FIRST_FRAMES + 1]
     t = problem.options.dt * torch.arange(len(first))
     gravity = problem.options.gravity / unit
     path = first - first[0]
-    flight = path + gravity * (t**2 / 2)[:, None] * torch.tensor([0.0, 0.0, 1.0])  # less the fall of a free object
+    flight = path + gravity * (t**2 / 2)[:, None] * torch.tensor([0.0, 0.0, 1.0])  # displacement without free fall
     velocity = (t[:, None] * flight).sum(0) / t.square().sum()
     off = (flight[:, 2] - velocity[2] * t).norm()
     supported = bool((path[:, 2].abs() < still).all() or path[:, 2].norm() < off)

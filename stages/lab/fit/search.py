@@ -1,12 +1,12 @@
-"""The search for the parameters, over increasingly long initial segments of the track, and their uncertainty.
+"""Search for the parameters over increasingly long initial segments of the track, and estimate of their uncertainty.
 
-Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
-Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
-stays near its initial value, by a normal prior. Derivatives are by differences about as large as the uncertainty, in
-independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
-noise remain, CMA-ES searches the region which the segments before have left. An engine need not be able to follow the
-track that closely: where the search no longer gains, what remains is taken for the error of the engine, which is then
-expected of longer segments and widens the uncertainty.
+Over the whole track, collisions give the cost many local minima, whereas the first frames depend on few parameters.
+Each segment is fitted starting from the result of the previous one, as in an iterated Kalman filter; a normal prior
+keeps parameters that a segment does not determine near their initial values. Because contacts make the motion a rough
+function of the parameters, derivatives are finite differences about as large as the uncertainty, in uncorrelated
+directions. If residuals larger than the noise remain, CMA-ES searches the region left by the previous segments. An
+engine may be unable to reproduce the track that closely: when the search stops improving, the remaining residual is
+attributed to the engine, accepted for longer segments, and added to the uncertainty.
 Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
 filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
 """
@@ -33,39 +33,42 @@ from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.problem import Problem
 
 log = logging.getLogger(__name__)
-SMALLEST_ERROR = 1e-3  # of a residual [tolerances]: the accuracy of the engines
-PRIOR = 1 / 12**0.5  # standard deviation of the prior: that of a uniform distribution over the range
-FIRST, GROWTH = 4, 1.15  # frames of the first segment, and factor from one to the next
-NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)  # differences [standard deviations], in the search and for intervals
-ONE_SIDED = 3.0  # ratio of the changes to both sides above which the smaller one gives a derivative
-STEPS = 6  # iterations of Levenberg and Marquardt's method
-PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative fall of the cost at which a method ends
-SPREADS = (0.5, 1.0, 0.2, 1.5)  # of CMA-ES, in turn [standard deviations]; it ends when none of them gains
-GAIN = 0.05  # least relative fall of the cost that counts as one
-GENERATIONS = 15  # of CMA-ES at a time
-ENOUGH = 1.15, 0.0005  # cost at which a fit ends: a factor on that of the track's noise, and a constant
-SMALLEST = 0.002  # standard deviation of a parameter [ranges]
-SETTLING = 2  # times that the uncertainty is estimated at the end, each with differences of the size of the last
-WIDER = 3.0  # factor on that of the search, from which they start: what is rough looks known by small differences
-OUTCOME = 2  # simulations whose motions are compared with the track at the end: of the initial values and of the result
+SMALLEST_ERROR = 1e-3  # lower bound of the standard deviation of a residual: the accuracy of the engines [tolerances]
+PRIOR = 1 / 12**0.5  # standard deviation of the prior: that of a uniform distribution over the range [ranges]
+FIRST, GROWTH = 4, 1.15  # length of the first segment [frames], and ratio of the lengths of successive segments
+# sizes of finite differences in the search, and for intervals [standard deviations]
+NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)
+ONE_SIDED = 3.0  # ratio of forward to backward change (or the reverse) above which only the smaller one is used
+STEPS = 6  # iterations of the Levenberg-Marquardt method
+PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative decrease of the cost at which a method stops
+SPREADS = (0.5, 1.0, 0.2, 1.5)  # initial step sizes of CMA-ES, in turn [standard deviations]; stops if all fail
+GAIN = 0.05  # smallest relative decrease of the cost that counts as an improvement
+GENERATIONS = 15  # of each CMA-ES run
+ENOUGH = 1.15, 0.0005  # a fit stops at this factor times the cost of the track's noise plus this constant
+SMALLEST = 0.002  # lower bound of the standard deviation of a parameter [ranges]
+SETTLING = 2  # final estimates of the uncertainty, each with differences scaled by the previous estimate
+# Factor on the uncertainty of the search from which the final estimates start: where the motion is a rough function of
+# a parameter, small differences underestimate its uncertainty.
+WIDER = 3.0
+OUTCOME = 2  # final simulations compared with the track: one with the initial values, one with the result
 
 
 class OutOfTime(Exception):
-    """No simulation begins any more, as its time is over or kept for others."""
+    """No further simulation may start: the time is over, or the rest is reserved."""
 
 
 def descent_simulations(parameters: int) -> int:
-    """The most that `descend` makes."""
+    """Upper bound of the simulations that `descend` runs."""
     return STEPS * (1 + 1 + 2 * parameters) + 2
 
 
 def interval_simulations(parameters: int) -> int:
-    """Those that `with_intervals` makes."""
+    """Number of simulations that `with_intervals` runs."""
     return SETTLING * (1 + 2 * len(FAR) * parameters)
 
 
 def final_simulations(parameters: int) -> int:
-    """The most that the end of a fit takes: the error, a descent, the intervals and the outcome."""
+    """Upper bound of the simulations at the end of a fit: the error, a descent, the intervals and the outcome."""
     return 1 + descent_simulations(parameters) + interval_simulations(parameters) + OUTCOME
 
 
@@ -73,19 +76,19 @@ class Estimate(NamedTuple):
     """Parameters and their uncertainty [ranges]."""
 
     x: Float[np.ndarray, "p"]
-    root: Float[np.ndarray, "p p"]  # of the covariance, root @ root.T; its columns are the directions of differences
+    root: Float[np.ndarray, "p p"]  # the covariance is root @ root.T; finite differences are along its columns
 
     @property
     def deviations(self) -> Float[np.ndarray, "p"]:
-        """Standard deviations of the parameters, at most those of the prior."""
+        """Standard deviations of the parameters, at most that of the prior."""
         return np.minimum(np.linalg.norm(self.root, axis=1), PRIOR)
 
 
 class Simulations:
-    """Simulates the problem at many points at once and counts them; `map` is that of a pool of processes.
+    """Simulates the problem at many points in parallel and counts the simulations; `map_` is that of a process pool.
 
-    `until` is the time of `time.perf_counter` from which none begins [s]. Time for `reserved` simulations of the whole
-    track is kept before, as measured on those so far, but no more than half of what there was.
+    No simulation starts after `until`, a time of `time.perf_counter` [s]. Before that, time is reserved for `reserved`
+    simulations of the whole track, estimated from those so far, but at most half of the initial time.
     """
 
     def __init__(self, problem: Problem, map_: Callable, until: float = math.inf):
@@ -93,12 +96,13 @@ class Simulations:
         self.start = np.array([p.coordinate(p.start) for p in problem.parameters])
         self.until, self.reserved = until, 0
         self._half = max(0.0, until - time.perf_counter()) / 2
-        self._seconds, self._frames = 0.0, 0  # of all simulations after the first ones, which wait for the processes
+        # totals over all simulations but the first ones, whose time includes the start of the processes
+        self._seconds, self._frames = 0.0, 0
 
     def residuals(self, points: list[np.ndarray], frames: int) -> list[np.ndarray]:
-        """Residuals in the first frames, at points that are moved into the ranges. Raises OutOfTime."""
+        """Residuals in the first frames, at points clamped to the ranges. Raises OutOfTime."""
         found: list[np.ndarray] = []
-        self._check()  # before the pool has anything to do
+        self._check()  # before any work is submitted to the pool
         begun, measured = time.perf_counter(), self.count > 0
         for residuals in self._map(_residuals, [np.clip(x, 0, 1) for x in points], [frames] * len(points)):
             found.append(residuals)
@@ -116,16 +120,16 @@ class Simulations:
             raise OutOfTime
 
     def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
-        """Costs of the first frames."""
+        """Costs over the first frames at several points."""
         part = self.problem.first_frames(frames)
         return [part.cost(residuals) for residuals in self.residuals(points, frames)]
 
     def cost(self, x: np.ndarray, frames: int) -> float:
-        """Cost of the first frames."""
+        """Cost over the first frames at one point."""
         return self.costs([x], frames)[0]
 
     def error(self, x: np.ndarray, frames: int) -> float:
-        """Standard deviation of a residual in the first frames [tolerances], from those that remain at x."""
+        """Standard deviation of a residual in the first frames [tolerances], from the residuals at x."""
         return max(self.problem.first_frames(frames).error(self.residuals([x], frames)[0]), SMALLEST_ERROR)
 
     @property
@@ -134,7 +138,7 @@ class Simulations:
         return max(self.problem.noise_level, SMALLEST_ERROR)
 
 
-_problem: Problem | None = None  # of this process
+_problem: Problem | None = None  # of this worker process
 
 
 def _set_problem(problem: Problem, threads: int) -> None:
@@ -150,7 +154,7 @@ def _residuals(x: np.ndarray, frames: int) -> np.ndarray:
 
 @contextmanager
 def simulations(problem: Problem, workers: int, until: float = math.inf) -> Iterator[Simulations]:
-    """Simulations of a problem until a time, in `workers` processes if several."""
+    """Simulations of a problem until a time, in a pool of `workers` processes, or in this process if there is one."""
     if workers == 1:
         _set_problem(problem, torch.get_num_threads())
         yield Simulations(problem, map, until)
@@ -160,12 +164,12 @@ def simulations(problem: Problem, workers: int, until: float = math.inf) -> Iter
 
 
 def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
-    """Fit increasingly long initial segments of the track, in the time that is not kept for the end of the fit.
+    """Fit increasingly long initial segments of the track, in the time that is not reserved for the end of the fit.
 
     Raises MissingPackage without the package cma.
     """
     total, sims.reserved = len(sims.problem.track), final_simulations(len(sims.problem.parameters))
-    known = Estimate(sims.start, np.diag([p.step for p in sims.problem.parameters]))  # before the present segment
+    known = Estimate(sims.start, np.diag([p.step for p in sims.problem.parameters]))  # result of the previous segments
     x, lengths = known.x, [min(FIRST, total)]
     while lengths[-1] < total:
         lengths.append(min(total, max(lengths[-1] + 1, int(GROWTH * lengths[-1]))))
@@ -177,7 +181,8 @@ def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
             if sims.cost(x, frames) < enough:
                 continue
             x = descend(sims, frames, Estimate(x, known.root), sims.noise)
-            share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)  # few segments need it
+            # allow three times an equal share of the evaluations, since few segments need CMA-ES
+            share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)
             cost, attempt, idle = sims.cost(x, frames), 0, 0
             while cost > enough and idle < len(SPREADS) and sims.count < share:
                 x = _evolve(sims, frames, x, known, attempt, options)
@@ -192,10 +197,10 @@ def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
 
 
 def with_intervals(sims: Simulations, frames: int, known: Estimate, error: float) -> Estimate:
-    """The estimate with its uncertainty for an error of a residual [tolerances]. Raises OutOfTime.
+    """The estimate with its uncertainty, given the error of a residual [tolerances]. Raises OutOfTime.
 
-    Differences are by one parameter at a time: directions of several, of which one changes the motion roughly and the
-    other steadily, tell nothing about each.
+    One parameter is varied at a time: along a direction that combines parameters, of which one changes the motion
+    roughly and another smoothly, differences say nothing about either.
     """
     deviations = WIDER * known.deviations
     for _ in tqdm(range(SETTLING), desc="intervals", unit="pass"):
@@ -205,10 +210,10 @@ def with_intervals(sims: Simulations, frames: int, known: Estimate, error: float
 
 
 def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np.ndarray:
-    """The minimum near `known`, by Levenberg and Marquardt's method, or `known.x` itself where the cost does not fall.
+    """The minimum near `known`, by the Levenberg-Marquardt method; `known.x` if the cost does not decrease.
 
-    `error` is the standard deviation of a residual [tolerances], against which the prior is weighed. Where the time
-    ends, the best point so far.
+    `error` is the standard deviation of a residual [tolerances], which sets the weight of the prior. Returns the best
+    point so far if the time runs out.
     """
     weight, part, tried = error / PRIOR, sims.problem.first_frames(frames), [(math.inf, known.x)]
 
@@ -235,16 +240,17 @@ def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np
 def _evolve(
     sims: Simulations, frames: int, x: np.ndarray, known: Estimate, attempt: int, options: MaterialFitOptions
 ) -> np.ndarray:
-    """The best of some generations of CMA-ES in units of the uncertainty, from `x` and from `known.x` in turn.
+    """The best point of a few generations of CMA-ES, with steps in units of the uncertainty.
 
-    Where the time ends, the best so far.
+    Even attempts start from `x`, odd ones from `known.x`. Returns the best point so far if the time runs out.
     """
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it
     except ImportError as error:
         raise MissingPackage("a fit needs the package cma: `pip install 'ngff[fit]'`") from error
 
-    size = options.workers * -(-(4 + int(3 * np.log(len(x)))) // options.workers)  # the usual one, for all workers
+    # the default population size of CMA-ES, rounded up to a multiple of the workers
+    size = options.workers * -(-(4 + int(3 * np.log(len(x)))) // options.workers)
     middle = known.x if attempt % 2 else x
     strategy = cma.CMAEvolutionStrategy(np.zeros(len(x)), SPREADS[attempt % len(SPREADS)], {
         "popsize": size, "seed": options.seed + attempt + 1, "verbose": -9, "maxiter": GENERATIONS, "tolx": PRECISION,
@@ -265,11 +271,11 @@ def _evolve(
 def narrowed(
     sims: Simulations, frames: int, known: Estimate, error: float, distances: Sequence[float] = NEAR
 ) -> Estimate:
-    """The estimate with the uncertainty that is left after the first frames, and the prior.
+    """The estimate with the uncertainty that remains given the first frames and the prior.
 
-    `error` is the standard deviation of a residual [tolerances]. Keypoints of one object in one frame count as one
-    observation, since their errors are not independent. Contacts make derivatives for small differences larger than
-    those for large ones: along each direction the smallest for the `distances` [standard deviations] counts.
+    `error` is the standard deviation of a residual [tolerances]. All keypoints of an object in a frame count as one
+    observation, since their errors are correlated. Contacts make derivatives larger for small differences than for
+    large ones, so the smallest over the `distances` [standard deviations] is used along each direction.
     """
     ends = [np.clip(known.x + sign * far * column, 0, 1)
             for column in known.root.T for far in distances for sign in (1, -1)]  # fmt: skip
@@ -277,7 +283,7 @@ def narrowed(
     moved = np.nan_to_num(np.array(moved) - middle).reshape(len(known.x), -1, len(middle))
     slopes = (moved[:, 0] - moved[:, 1]).T / (2 * distances[0])
     steps = np.linalg.norm(np.array(ends) - known.x, axis=1).reshape(len(known.x), -1)
-    steps = steps / np.linalg.norm(known.root, axis=0)[:, None]  # shorter at the ends of the ranges
+    steps = steps / np.linalg.norm(known.root, axis=0)[:, None]  # below `distances` where clamped to the range
     rises = np.linalg.norm(moved, axis=2) / np.maximum(steps, 1e-9)
     least = np.where(steps > distances[0] / 2, rises, np.inf).min(1)
     slopes = slopes * np.minimum(1, least / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)) / error
@@ -287,11 +293,12 @@ def narrowed(
 
 
 def _derivatives(sims: Simulations, frames: int, known: Estimate) -> Float[np.ndarray, "n p"]:
-    """Derivatives of the residuals along the columns of the root, by differences within the ranges.
+    """Derivatives of the residuals along the columns of the root, by finite differences within the ranges.
 
-    Those to one side only are biased by the curvature of the residuals, which is large where pictures are compared: the
-    search would end beside the minimum, along the parameters that trade against each other. So they are central, but
-    where the motion becomes another one to one side, as after a collision that is missed, and the other side counts.
+    One-sided differences are biased by the curvature of the residuals, which is large when images are compared: the
+    search would end beside the minimum, displaced along parameters that compensate each other. Differences are central,
+    therefore, unless the motion changes qualitatively on one side, for example because a collision is missed; then only
+    the other side is used.
     """
     ends = [np.clip(known.x + step, 0, 1) for column in NEAR[0] * known.root.T for step in (column, -column)]
     middle, *moved = sims.residuals([known.x, *ends], frames)

@@ -1,1 +1,1 @@
-"""Tracking of objects through the pictures of several fixed cameras."""
+"""Tracking of objects through the images of several fixed cameras."""

@@ -1,10 +1,10 @@
-"""Poses of objects from the difference between pictures and renderings: Gauss and Newton's method, coarse to fine.
+"""Poses of objects from the difference between images and renderings, by coarse-to-fine Gauss-Newton.
 
-A rendering I changes with a small motion of an object as its pixels move, dI = -grad I . du, where du is the projection
-of the motion of the point seen there. Pixels on an outline move with what is in front. Residuals are weighted by
-Geman and McClure's function, so that pixels which the scene does not explain (a hand, a shadow) have little effect.
-The gradient is the mean of those of rendering and picture, which converges in fewer steps. Both are reduced by the same
-means of blocks of pixels: renderings at a lower resolution would be biased.
+A small motion of an object changes a rendering I as its pixels move: dI = -grad I . du, where du is the projected
+motion of the point seen in the pixel. Pixels on an outline move with the object in front. Residuals have Geman-McClure
+weights, so that pixels which the scene does not explain (a hand, a shadow) have little effect. The gradient is the mean
+of the gradients of rendering and image, which converges in fewer steps. Both are reduced by the same block averaging;
+renderings at a lower resolution would be biased.
 Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on"; Geman and McClure 1987, "Statistical methods for
 tomographic image reconstruction"; Benhimane and Malis 2004, "Real-time image-based tracking of planes using efficient
 second-order minimization".
@@ -23,42 +23,42 @@ from stages.core.geometry.cameras import resize
 from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Camera, Synthesis, Synthesiser
 
-PRIOR = (0.5, 0.5)  # standard deviations of the prediction: turn [rad] and displacement [sizes of the object]
-PIXEL_NOISE = 0.05  # standard deviation of a channel against which the prediction is weighed
-CONVERGED = 0.05  # largest displacement of the last step [px]
+PRIOR = (0.5, 0.5)  # standard deviations of the predicted pose: rotation [rad] and displacement [object sizes]
+PIXEL_NOISE = 0.05  # standard deviation of a colour channel (0..1) that weighs images against the predicted pose
+CONVERGED = 0.05  # displacement of the last step below which iteration stops [px]
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A picture at one resolution, and how far the objects are from their poses when it was taken."""
+    """An image at one resolution, and how far the objects have moved from their poses when it was taken."""
 
-    film: int  # its number
-    late: float  # time after that of the poses [frames]
+    film: int  # index of the film
+    late: float  # delay of the image after the time of the poses [frames]
     camera: Camera
-    reduction: int  # of the picture
-    image: Float[Tensor, "h w c"]  # nan where not known
-    displacement: Float[Tensor, "o 6"]  # turn [rad] and displacement [scene units]
+    reduction: int  # of the image
+    image: Float[Tensor, "h w c"]  # nan where unknown
+    displacement: Float[Tensor, "o 6"]  # motion of each object during `late`: rotation [rad], translation [scene units]
 
     def draw(self, synthesiser: Synthesiser, poses: Poses) -> Synthesis:
-        """The rendering that this picture is compared with."""
+        """The rendering that this image is compared with."""
         return synthesiser.draw(self.camera, poses.moved(self.displacement), self.reduction)
 
     def difference(self, drawn: Synthesis) -> Float[Tensor, "h w c"]:
-        """Of the picture to the rendering, 0 where the picture is not known."""
+        """Image minus rendering; 0 where the image is unknown."""
         return (self.image - drawn.image).nan_to_num(0.0)
 
 
 @dataclass(frozen=True)
 class PixelChanges:
-    """The pixels of a picture that show moving objects, and how they change."""
+    """The pixels of an image that show moving objects: their residuals, and derivatives by the objects' motion."""
 
-    row: Tensor  # (p) object
+    row: Tensor  # (p) object in each pixel
     residual: Float[Tensor, "p c"]
-    jacobian: Float[Tensor, "p c 6"]  # of the rendering by turn [1/rad] and displacement [1/scene unit]
+    jacobian: Float[Tensor, "p c 6"]  # of the rendering, by rotation [1/rad] and displacement [1/scene unit]
 
 
 def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"]) -> PixelChanges:
-    """Residuals, and derivatives of the rendering by the motion of the objects about `centre`."""
+    """Residuals, and derivatives of the rendering by rotation about `centre` and displacement of the objects."""
     at = drawn.moving >= 0
     difference = seen.difference(drawn)
     mean = drawn.image + difference / 2
@@ -71,7 +71,7 @@ def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"])
     projection = torch.stack([
         torch.stack([K[0, 0] / z, zero, -K[0, 0] * p[:, 0] / z**2], 1),
         torch.stack([zero, K[1, 1] / z, -K[1, 1] * p[:, 1] / z**2], 1),
-    ], 1) @ V[:3, :3]  # fmt: skip  # (p, 2, 3), by motion of the point in the world
+    ], 1) @ V[:3, :3]  # fmt: skip  # (p, 2, 3), derivative by the motion of the point in the world
     by_place = -gradient @ projection  # (p, c, 3)
     arm = (point - centre[row])[:, None].expand_as(by_place)
     by_turn = torch.linalg.cross(arm, by_place)  # a . (w x r) = w . (r x a)
@@ -79,7 +79,7 @@ def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"])
 
 
 def _central(image: Float[Tensor, "h w c"], dim: int) -> Float[Tensor, "h w c"]:
-    """Derivative along rows (0) or columns (1) by central differences, 0 on the border."""
+    """Derivative along rows (0) or columns (1) by central differences; 0 on the border."""
     out = torch.zeros_like(image)
     n = image.shape[dim]
     out.narrow(dim, 1, n - 2).copy_((image.narrow(dim, 2, n - 2) - image.narrow(dim, 0, n - 2)) / 2)
@@ -87,12 +87,12 @@ def _central(image: Float[Tensor, "h w c"], dim: int) -> Float[Tensor, "h w c"]:
 
 
 def robust_weights(residual: Float[Tensor, "p c"], scale: float) -> Float[Tensor, "p"]:
-    """Geman and McClure's weights, for residuals of this scale."""
+    """Geman-McClure weights of residuals, for the given scale."""
     return (scale**2 / (scale**2 + residual.square().mean(1))).square()
 
 
 def robust_cost(residual: Float[Tensor, "*b c"], scale: float) -> float:
-    """Mean of Geman and McClure's function, from 0 to 1."""
+    """Mean of the Geman-McClure function, from 0 to 1."""
     square = residual.square().mean(-1)
     return float((square / (scale**2 + square)).mean())
 
@@ -101,10 +101,10 @@ def align(
     synthesiser: Synthesiser, levels: Sequence[tuple[list[Observation], int]], poses: Poses, scale: Sequence[float],
     fixed: Tensor | None = None,
 ) -> Poses:  # fmt: skip
-    """The poses that explain the pictures best, found from poses nearby.
+    """The poses that explain the images best, starting from nearby poses.
 
-    `levels` are the observations at each resolution, coarse to fine, with the largest number of steps there; `scale` is
-    that of the residuals of each object. Objects in the mask `fixed` stay.
+    `levels` holds the observations at each resolution, coarse to fine, with the maximum number of steps; `scale` is the
+    Geman-McClure scale of each object. Objects in the mask `fixed` keep their poses.
     """
     start = poses
     for observations, steps in levels:
@@ -123,7 +123,7 @@ def align(
 def _step(
     synthesiser: Synthesiser, observations: list[Observation], poses: Poses, predicted: Poses, scale: Sequence[float]
 ) -> Float[Tensor, "o 6"]:
-    """A step of all objects from the pictures of all cameras."""
+    """One Gauss-Newton step of all objects, from the images of all cameras."""
     changes = [change_of(o, o.draw(synthesiser, poses), poses.centre) for o in observations]
     row = torch.cat([c.row for c in changes])
     residual, jacobian = torch.cat([c.residual for c in changes]), torch.cat([c.jacobian for c in changes])
@@ -137,7 +137,7 @@ def _step(
         prior = PIXEL_NOISE**2 / torch.cat([size.new_full((3,), PRIOR[0]), PRIOR[1] * size.expand(3)]).square()
         H = H + prior.diag() + 1e-4 * H.diagonal().diag()
         step = torch.linalg.solve(H.double(), (b + prior * off[i]).double()).float()
-        # no further than half the object in a step
+        # limit the step to half the size of the object
         reach = (step[:3].norm() * size + step[3:].norm()) / (0.5 * size)
         steps.append(step / reach.clamp_min(1.0))
     return torch.stack(steps)

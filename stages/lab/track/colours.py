@@ -1,9 +1,9 @@
-"""Colours of the sides of objects that no picture of the first frame shows, learned from later pictures.
+"""Colours of the sides of objects that are not visible at the release, learned from later images.
 
-A Gaussian that was not seen at the release takes the median, over the latest frames in which it is seen, of its colour
-then and what the picture differed there from the rendering: where several Gaussians share a pixel, this becomes sharper
-from frame to frame, and colours that were right stay. An object is learned from where it was followed without a gap
-for some frames, and from those pictures that agree with what is known of it already.
+A Gaussian not seen at the release gets the median, over the latest frames in which it is seen, of its current colour
+plus the difference between image and rendering there. Where several Gaussians share a pixel, this becomes sharper from
+frame to frame, and colours that are already right do not change. Colours are learned only while an object has been
+tracked without a gap for some frames, and only from images that agree with its known colours.
 Source: Irani and Peleg 1991, "Improving resolution by image registration" (iterative back-projection).
 """
 
@@ -24,30 +24,30 @@ from stages.lab.track.confidence import CONFIRMED, MIN_PIXELS
 from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Synthesiser
 
-BEHIND = 0.1  # how far a Gaussian that is seen may be behind the surface drawn there [sizes of its object]
-LATEST = 9  # frames of which the median is taken
-ENOUGH = 3  # the fewest of them in which a Gaussian is seen
+BEHIND = 0.1  # largest depth of a visible Gaussian behind the rendered surface [object sizes]
+LATEST = 9  # number of latest frames over which the median is taken
+ENOUGH = 3  # smallest number of these frames in which a Gaussian must be seen
 
 
 class Sightings(NamedTuple):
-    """The Gaussians of all objects in one picture."""
+    """Visibility and residual of the Gaussians of all objects in one image."""
 
-    seen: Bool[Tensor, "n"]  # inside the outline of their object, in front
-    off: Float[Tensor, "n c"]  # difference of the picture to the rendering there
+    seen: Bool[Tensor, "n"]  # inside the outline of their object, and not occluded
+    off: Float[Tensor, "n c"]  # image minus rendering at the pixel of the Gaussian
 
 
 class LaterColours:
-    """Which Gaussians of a synthesiser have known colours, and the colours of others as they are seen."""
+    """Which Gaussians of a synthesiser have known colours, and the colours observed for the others."""
 
     def __init__(self, synthesiser: Synthesiser, first: Sequence[Observation], tolerance: Sequence[float]):
         self.synthesiser, self.tolerance = synthesiser, torch.tensor(tolerance, device=synthesiser.device)
         rest = synthesiser.at_rest()
         self.known = torch.stack([sightings(synthesiser, o, rest).seen for o in first]).any(0)
-        self.unseen = (~self.known).nonzero()[:, 0]  # at the release
-        self._latest: deque[Float[Tensor, "m 3"]] = deque(maxlen=LATEST)  # colours of these, nan where not seen
+        self.unseen = (~self.known).nonzero()[:, 0]  # rows of the Gaussians not seen at the release
+        self._latest: deque[Float[Tensor, "m 3"]] = deque(maxlen=LATEST)  # colours of `unseen`, nan where not seen
 
     def learn(self, pictures: Sequence[Observation], poses: Poses, followed: Bool[Tensor, "o"]) -> None:
-        """Learn from the pictures of a frame, of the objects that were followed to their poses in it."""
+        """Learn from the images of a frame the colours of the objects that were `followed` up to it."""
         row = self.synthesiser.row
         if not followed[row[self.unseen]].any():
             return
@@ -65,7 +65,7 @@ class LaterColours:
             self.synthesiser.recolour(self.unseen[enough], latest[:, enough].nanquantile(0.5, dim=0))
 
     def _agrees(self, found: Sightings) -> Bool[Tensor, "o"]:
-        """Whether a picture has the colours of an object where it shows what is known of it."""
+        """Whether an image agrees with the known colours of each object."""
         row, shown = self.synthesiser.row, (found.seen & self.known).float()
         near = shown * (found.off.square().mean(1).sqrt() < self.tolerance[row])
         total, close = (torch.zeros_like(self.tolerance).index_add_(0, row, x) for x in (shown, near))
@@ -73,7 +73,7 @@ class LaterColours:
 
 
 def sightings(synthesiser: Synthesiser, picture: Observation, poses: Poses) -> Sightings:
-    """Which Gaussians of the objects at these poses a picture shows."""
+    """Visibility and residuals of the Gaussians in an image, with the objects at these poses."""
     drawn, row, camera = picture.draw(synthesiser, poses), synthesiser.row, picture.camera
     means = poses.moved(picture.displacement).place(synthesiser.arm, row)
     height, width = drawn.label.shape
@@ -86,6 +86,6 @@ def sightings(synthesiser: Synthesiser, picture: Observation, poses: Poses) -> S
 
 
 def _inner(label: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """The labels, -1 on outlines."""
+    """The labels, with -1 in pixels on outlines."""
     high, low = (sign * F.max_pool2d(sign * label[None, None].float(), 3, 1, 1)[0, 0] for sign in (1, -1))
     return torch.where(high == low, label, -1)

@@ -1,4 +1,4 @@
-"""How far pictures confirm that objects are where they are drawn."""
+"""Confidence of poses: to what extent images agree with renderings of the objects."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stages.lab.track.alignment import Observation
 from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Synthesiser
 
-MIN_PIXELS = 12  # of an object in a picture that says something about it
-MIN_SCALE = 0.1  # smallest scale of residuals: difference of a colour
-SCALE_FACTOR = 3.0  # of that difference to the median where the objects are known to be
-CHANCE = 0.25  # share of the pixels of an object at a wrong pose that may confirm it
-CONFIRMED = 0.6  # share of such pixels above which a picture confirms an object
-MIN_VIEWS = 2  # pictures that must confirm an object
+MIN_PIXELS = 12  # smallest visible area of an object for an image to count [px]
+MIN_SCALE = 0.1  # smallest scale of residuals [colours from 0 to 1]
+SCALE_FACTOR = 3.0  # scale of residuals relative to their median where the poses are known
+CHANCE = 0.25  # fraction of the pixels of an object at a wrong pose that may agree with the image by chance
+CONFIRMED = 0.6  # fraction of agreeing pixels from which an image confirms an object
+MIN_VIEWS = 2  # number of images that must confirm an object
 
 
 def differences(
     synthesiser: Synthesiser, observations: Sequence[Observation], poses: Poses
 ) -> list[list[Float[Tensor, "p"]]]:
-    """Difference in colour of the pixels that show each object, by picture and object."""
+    """Colour difference of the pixels that show each object, by image and object."""
     rows = range(len(synthesiser.rest))
     found = []
     for seen in observations:
@@ -34,26 +34,26 @@ def differences(
 
 
 def scales(right: list[list[Tensor]]) -> list[float]:
-    """For each object the scale of its residuals, from differences where its pose is known."""
+    """Residual scale of each object, from differences at known poses."""
     joined = [torch.cat(parts) for parts in zip(*right, strict=True)]
     return [max(SCALE_FACTOR * float(d.median()), MIN_SCALE) if len(d) else MIN_SCALE for d in joined]
 
 
 def tolerances(wrong: list[list[Tensor]], scale: Sequence[float]) -> list[float]:
-    """For each object the difference up to which a pixel confirms it: that which CHANCE of its pixels have at wrong
-    poses, but at least the scale of its residuals.
+    """Largest difference at which a pixel still confirms each object.
 
-    Residuals at the release do not tell: the scene was fitted to these pictures. Other sides of an object, seen later,
-    are known less well.
+    It is the CHANCE quantile of the differences at wrong poses, but at least the residual scale. Residuals at the
+    release would be too small: the scene was fitted to these images, and sides of an object seen later are known less
+    well.
     """
     joined = [torch.cat(parts) for parts in zip(*wrong, strict=True)]
     return [max(float(d.quantile(CHANCE)), s) if len(d) else s for d, s in zip(joined, scale, strict=True)]
 
 
 def confidences(found: list[list[Tensor]], tolerance: Sequence[float]) -> tuple[Float[Tensor, "o"], Float[Tensor, "o"]]:
-    """Share of the pixels of each object that confirm it, 0 where fewer than MIN_VIEWS pictures do; and their number.
+    """Fraction of confirming pixels of each object (0 if fewer than MIN_VIEWS images confirm it), and number of pixels.
 
-    With one camera a single picture is enough.
+    If there is only one image, it is enough.
     """
     shares, pixels = [], []
     for parts, limit in zip(zip(*found, strict=True), tolerance, strict=True):

@@ -1,8 +1,8 @@
-"""Soft objects: how they deform, beyond their rigid poses.
+"""Deformation of soft objects, in addition to their rigid poses.
 
-Nodes spread over the object are displaced so that renderings agree with the pictures of all cameras, by Gauss and
-Newton's method on the same residuals as the poses, with a term that keeps the surroundings of each node as rigid as
-possible. What no picture shows follows by that term. Each frame starts from the one before.
+Nodes spread over the object are displaced such that renderings agree with the images of all cameras. The displacements
+minimise, by Gauss-Newton, the same residuals as the poses plus an as-rigid-as-possible term, which also determines the
+parts that no image shows. Each frame starts from the result of the previous one.
 Source: Sorkine and Alexa 2007, "As-rigid-as-possible surface modeling"; Sumner, Schmid and Pauly 2007, "Embedded
 deformation for shape manipulation".
 """
@@ -28,26 +28,26 @@ from stages.lab.track.follow import TrackedMotion, Tracker, motions
 from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Synthesiser
 
-NODES, FOLLOWED, NEIGHBOURS = 40, 4, 6  # of an object, that a point follows, and of a node
-STRETCH = 0.05  # standard deviation of the length of an edge between nodes that counts as one pixel [lengths]
-SPEED = 0.1  # the same of a node's displacement since the last frame [sizes of the object]
-STEPS = {4: 3, 2: 2}  # number of steps by reduction of the pictures, coarse to fine
+NODES, FOLLOWED, NEIGHBOURS = 40, 4, 6  # nodes of an object, nodes that a point follows, neighbours of a node
+STRETCH = 0.05  # edge deformation that weighs as much as one pixel with an error of PIXEL_NOISE [edge lengths]
+SPEED = 0.1  # node displacement since the last frame that weighs as much as one such pixel [object sizes]
+STEPS = {4: 3, 2: 2}  # number of Gauss-Newton steps by image reduction, coarse to fine
 
 
 @dataclass(frozen=True)
 class SoftBody:
-    """The nodes of an object, about its centre at rest."""
+    """The deformation nodes of an object, relative to its centre at rest."""
 
     row: int  # of the object
     nodes: Float[Tensor, "k 3"]
     edges: Int[Tensor, "e 2"]
-    gaussians: Bool[Tensor, "n"]  # of all objects, those of this one
-    index: Int[Tensor, "m j"]  # of the nodes that each of them follows
-    weight: Float[Tensor, "m j"]
+    gaussians: Bool[Tensor, "n"]  # mask of this object's Gaussians among those of all objects
+    index: Int[Tensor, "m j"]  # nodes that each Gaussian of the object follows
+    weight: Float[Tensor, "m j"]  # of these nodes
 
     @staticmethod
     def of(synthesiser: Synthesiser, row: int) -> SoftBody:
-        """The nodes of an object, spread over its Gaussians."""
+        """Distribute nodes over the Gaussians of an object."""
         mine = synthesiser.row == row
         arm = synthesiser.arm[mine]
         nodes = arm[farthest_points(arm, NODES).to(arm.device)]
@@ -57,20 +57,20 @@ class SoftBody:
         return SoftBody(row, nodes, torch.stack([start, near], -1).flatten(0, 1), mine, index, weight)
 
     def bent(self, synthesiser: Synthesiser, u: Float[Tensor, "k 3"]) -> Synthesiser:
-        """The synthesiser with this object deformed by displacements of its nodes."""
+        """A copy of the synthesiser with this object deformed by displacements of its nodes."""
         other = copy(synthesiser)
         other.arm = synthesiser.arm.clone()
         other.arm[self.gaussians] += (self.weight[..., None] * u[self.index]).sum(1)
         return other
 
     def displaced(self, u: Float[Tensor, "*t k 3"], points: Float[Tensor, "p 3"]) -> Float[Tensor, "*t p 3"]:
-        """Displacements of points about the centre at rest that follow the nodes."""
+        """Displacements of points that follow the nodes; points are relative to the centre at rest."""
         index, weight = nearest_weights(self.nodes, points, FOLLOWED)
         return (weight[..., None] * u[..., index, :]).sum(-2)
 
 
 def soft_rows(scene: Scene, names: str) -> list[int]:
-    """Rows of the objects of these names, separated by commas. Raises InputError for others."""
+    """Rows of the objects in a comma-separated list of names. Raises InputError for unknown names."""
     wanted, known = [n.strip() for n in names.split(",") if n.strip()], [o.name for o in scene.objects]
     if other := [name for name in wanted if name not in known]:
         raise InputError(f"--soft {other[0]}: the scene has no such object; it has {', '.join(known)}")
@@ -80,7 +80,7 @@ def soft_rows(scene: Scene, names: str) -> list[int]:
 def deformations(
     tracker: Tracker, track: TrackedMotion, rows: Sequence[int]
 ) -> tuple[TrackedMotion, dict[int, tuple[SoftBody, Float[Tensor, "t k 3"]]]]:
-    """Displacements of the nodes of soft objects in all frames, and the track with confidences of the deformed ones."""
+    """Node displacements of soft objects in all frames, and the track with the confidences of the deformed objects."""
     shares, found = track.confidence.clone(), {}
     for row in rows:
         body = SoftBody.of(tracker.synthesiser, row)
@@ -101,7 +101,7 @@ def _fit(
     tracker: Tracker, body: SoftBody, last: Float[Tensor, "k 3"], poses: Poses,
     levels: list[tuple[list[Observation], int]],
 ) -> Float[Tensor, "k 3"]:  # fmt: skip
-    """The displacements that explain the pictures best, from those of the last frame."""
+    """The displacements that explain the images best, starting from those of the last frame."""
     u, size, scale = last, float(tracker.synthesiser.sizes[body.row]), tracker.scale[body.row]
     slow = (PIXEL_NOISE / (SPEED * size)) ** 2
     for observations, steps in levels:
@@ -119,13 +119,13 @@ def _fit(
 def _evidence(
     synthesiser: Synthesiser, body: SoftBody, u: Tensor, poses: Poses, seen: Observation, scale: float
 ) -> tuple[Float[Tensor, "m m"], Float[Tensor, "m"]]:
-    """Normal equations of the displacements from one picture."""
+    """Normal equations of the displacements from one image."""
     drawn = seen.draw(synthesiser, poses)
     change = change_of(seen, drawn, poses.centre)
     mine = change.row == body.row
     then = poses.moved(seen.displacement)
     R, c = then.rotation[body.row], then.centre[body.row]
-    point = (drawn.point[drawn.moving >= 0][mine] - c) @ R  # in the frame of rest
+    point = (drawn.point[drawn.moving >= 0][mine] - c) @ R  # in the rest frame of the object
     r, J = change.residual[mine], change.jacobian[mine][..., 3:] @ R
     k = len(body.nodes)
     H, b = J.new_zeros(k * k, 9), J.new_zeros(k, 3)
@@ -141,7 +141,7 @@ def _evidence(
 
 
 def _rigidity(body: SoftBody, u: Float[Tensor, "k 3"]) -> tuple[Float[Tensor, "m m"], Float[Tensor, "m"]]:
-    """Normal equations of the term that keeps the surroundings of each node rigid."""
+    """Normal equations of the as-rigid-as-possible term."""
     i, j = body.edges.unbind(1)
     k, rest = len(u), body.nodes[body.edges[:, 1]] - body.nodes[body.edges[:, 0]]
     now = rest + u[j] - u[i]
@@ -158,7 +158,7 @@ def _rigidity(body: SoftBody, u: Float[Tensor, "k 3"]) -> tuple[Float[Tensor, "m
 def followed(
     bodies: dict[int, tuple[SoftBody, Tensor]], row: Int[Tensor, "p"], arm: Float[Tensor, "p 3"]
 ) -> Iterator[Float[Tensor, "p 3"]]:
-    """For each frame, the displacements of keypoints about the centres of their objects at rest."""
+    """For each frame, the displacements of keypoints by soft bodies, in the rest frames of their objects."""
     frames = len(next(iter(bodies.values()))[1])
     out = torch.zeros(frames, *arm.shape)
     for i, (body, u) in bodies.items():

@@ -1,4 +1,4 @@
-"""Label images of the frames of films: which object each pixel shows, from any tool."""
+"""Label images of film frames, made by any tool: which object each pixel shows."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.segment.masks import read_names
 
-UNKNOWN = -1  # of a pixel that the label images say nothing about
+UNKNOWN = -1  # label of pixels that the label images leave undefined
 
 
 @dataclass(frozen=True)
 class FilmMasks:
-    """A folder with a folder of label images for each film, one for each frame, in the order of their names."""
+    """A folder with one folder of label images per film, with one image per frame, in the order of their names."""
 
     folder: Path
-    rows: Mapping[int, int]  # row of the object that a number in the images stands for
-    ignored: frozenset[int]  # numbers of pixels that say nothing
+    rows: Mapping[int, int]  # object row for each number in the images
+    ignored: frozenset[int]  # numbers that mark undefined pixels
 
     def of_film(self, name: str) -> list[Path]:
-        """The label images of a film, in a folder of its name with or without suffix; empty without such a folder."""
+        """The label images of a film, from a folder named like it, with or without suffix; empty if there is none."""
         found = [self.folder / stem for stem in (name, Path(name).stem) if (self.folder / stem).is_dir()]
         return list_photos(found[0]) if found else []
 
     def read(self, file: Path, cameras: Cameras, view: int, size: tuple[int, int]) -> Int16[Tensor, "h w"]:
-        """1 + row of the object in each pixel of a reduced view, 0 for others, UNKNOWN where ignored.
+        """1 + object row in each pixel of a reduced view, 0 for other pixels, UNKNOWN where ignored.
 
-        Raises InputError for an image of another aspect ratio than the film, or without any object's number.
+        Raises InputError if the aspect ratio differs from that of the film, or if the image has none of the objects.
         """
         labels = read_labels(file)
         try:
@@ -52,10 +52,10 @@ class FilmMasks:
 
 
 def find_film_masks(folder: Path, scene: Scene, films: list[str]) -> FilmMasks:
-    """The label images of films. Numbers are ids of the scene's objects, or of names.json those of the same name.
+    """The label images of films. Numbers in the images are object ids of the scene, or map to names by names.json.
 
-    Pixels of IGNORE_LABEL are unknown, unless it is the number of an object. Raises InputError for a folder without
-    label images of any of the films.
+    Pixels of IGNORE_LABEL are unknown, unless an object has this number. Raises InputError if the folder has no label
+    images for any of the films.
     """
     folder = Path(folder)
     if not folder.is_dir():

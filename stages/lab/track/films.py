@@ -1,4 +1,4 @@
-"""Films of a scene's cameras, as undistorted views at the resolution at which they are compared with renderings."""
+"""Reading of the films of a scene's cameras, as undistorted images at the resolution of the renderings."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from stages.core.scene.scene import Scene
 from stages.lab.track.film_masks import find_film_masks
 
 log = logging.getLogger(__name__)
-MULTIPLE = 8  # of which sizes are, so that pictures can be reduced
+MULTIPLE = 8  # image sizes are multiples of this, so that images can be reduced by whole factors
 
 
 @dataclass(frozen=True)
 class Film:
-    """The pictures of one camera."""
+    """The images of one camera."""
 
     name: str
     frames: UInt8[Tensor, "t h w 3"]
-    start: float  # number of the frame at the release, with fractions
-    labels: Int16[Tensor, "t h w"] | None = None  # of the objects in each pixel, as FilmMasks.read gives them
+    start: float  # frame number at the release, with fractions
+    labels: Int16[Tensor, "t h w"] | None = None  # object in each pixel, as returned by FilmMasks.read
 
 
 def list_films(scene: Scene, folder: Path) -> dict[str, Path]:
-    """The films in a folder of the scene's cameras, by name. Raises InputError where there are none."""
+    """The films in a folder that belong to cameras of the scene, by name. Raises InputError if there are none."""
     recordings, starts = list_recordings(folder), scene.sequence.starts
     timed = [name for name in scene.cameras.names if name in starts]
     if missing := [name for name in timed if name not in recordings]:
@@ -50,10 +50,10 @@ def list_films(scene: Scene, folder: Path) -> dict[str, Path]:
 def read_films(
     scene: Scene, recordings: Mapping[str, Path], frames: int, resolution: int, masks: Path | None = None
 ) -> tuple[Cameras, list[Film]]:
-    """The cameras of these recordings, at the resolution at which these are read, and their films.
+    """Read recordings; return their cameras, at the resolution of the images, and the films.
 
-    Films are read until `frames` after the release, with their label images in the folder `masks`. Raises InputError
-    for a film without frames, or of more frames than label images.
+    Films are read until `frames` after the release, with their label images from the folder `masks`. Raises InputError
+    for a film without frames, or with more frames than label images.
     """
     cameras, starts = scene.cameras, scene.sequence.starts
     rows = [i for i, name in enumerate(cameras.names) if name in recordings]
@@ -83,7 +83,7 @@ def read_films(
 
 
 def _reduced_cameras(cameras: Cameras, resolution: int) -> Cameras:
-    """The cameras with sizes that are multiples of MULTIPLE, no larger than the views."""
+    """The cameras at reduced sizes that are multiples of MULTIPLE."""
     scale = (resolution / cameras.sizes.max(1).values).clamp_max(1.0)
     sizes = (cameras.sizes * scale[:, None] / MULTIPLE).round().long().clamp_min(1) * MULTIPLE
     ratio = sizes / cameras.sizes

@@ -1,4 +1,4 @@
-"""Follow objects through the pictures of several cameras."""
+"""Tracking of objects frame by frame through the images of several cameras."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from stages.lab.track.search import search, spread_rotations, without
 from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 
 log = logging.getLogger(__name__)
-FIRST = {8: 4, 4: 4}  # largest number of steps by reduction of the pictures, in the first pass
-REFINING = {4: 2, 2: 2}  # the same where both neighbours in time are known
-JUDGING = 2  # reduction of the pictures from which confidences are taken
-RETIMING = (4, 2)  # reduction of the pictures from which starts are corrected, before each later pass
-RETIMING_STEPS = 2
-CERTAIN = 0.85  # confidence from which a lost object counts as found, of that which is usual for it
-FOUND = 0.75  # the same of one that was searched, at a pose that is distinct
-LASTING = 3  # frames for which an object that was found again must be seen
-WRONG_TURNS, WRONG_VIEWS = 8, 3  # wrong rotations and pictures from which tolerances are taken
-FALLING = 6  # frames of a fall from which the time of the release is found
-MAX_MISFIT = 0.1  # of a free fall in them [frames]
+FIRST = {8: 4, 4: 4}  # maximum number of Gauss-Newton steps by image reduction, in the first pass
+REFINING = {4: 2, 2: 2}  # the same in later passes, where both neighbouring frames are known
+JUDGING = 2  # image reduction at which confidences are computed
+RETIMING = (4, 2)  # image reduction at which film starts are corrected, before each later pass
+RETIMING_STEPS = 2  # Gauss-Newton steps of each correction of the film starts
+CERTAIN = 0.85  # confidence, relative to the object's usual one, from which a lost object counts as found
+FOUND = 0.75  # the same for an object found by a search with an unambiguous pose
+LASTING = 3  # number of frames for which an object found again must stay visible
+WRONG_TURNS, WRONG_VIEWS = 8, 3  # number of wrong rotations and of images from which tolerances are computed
+FALLING = 6  # number of frames of free fall to which the release time is fitted
+MAX_MISFIT = 0.1  # largest deviation from free fall in these frames [frames]
 
 
 @dataclass(frozen=True)
 class TrackedMotion:
-    """Poses of all objects in all frames, and how far the pictures confirm them."""
+    """Poses of all objects in all frames, with confidences."""
 
-    poses: Poses  # t frames
+    poses: Poses  # batch of t frames
     confidence: Float[Tensor, "t o"]  # 0: lost
-    pixels: Float[Tensor, "t o"]  # in which each object should be seen
-    starts: dict[str, float]  # of the films, as refined
+    pixels: Float[Tensor, "t o"]  # number of pixels in which each object is expected to be visible
+    starts: dict[str, float]  # corrected start of each film [frames]
 
 
 class Tracker:
-    """A scene and its films, at several resolutions."""
+    """A scene and its films, with the operations on single frames at several resolutions."""
 
     def __init__(self, scene: Scene, cameras: Cameras, films: list[Film], device: str):
         labelled = any(film.labels is not None for film in films)
@@ -63,20 +63,20 @@ class Tracker:
         self.colours = LaterColours(self.synthesiser, self.observe(0, 1, self.still, self.still), self.tolerance)
 
     def _wrong(self, first: list[Observation]) -> list[list[Tensor]]:
-        """Differences to pictures of the release where all objects are turned wrongly."""
+        """Differences to images of the release with all objects rotated wrongly."""
         turns = spread_rotations(WRONG_TURNS).to(self.device)
         turned = [Poses(turn.expand_as(self.rest.rotation), self.rest.centre) for turn in turns]
         return [row for poses in turned for row in differences(self.synthesiser, first, poses)]
 
     def _gain(self, i: int) -> Float[Tensor, "3"]:
-        """Brightness of a film's channels over those of the scene, at the release."""
+        """Brightness of a film relative to the scene, per channel, at the release."""
         film = self.films[i]
         drawn = self.synthesiser.draw(self.cameras[i], self.rest).image[..., :3]
         first = film.frames[min(max(int(film.start), 0), len(film.frames) - 1)].to(self.device).float() / 255
         return ((first * drawn).sum((0, 1)) / drawn.square().sum((0, 1)).clamp_min(1e-6)).clamp(0.5, 2.0)
 
     def observe(self, frame: int, reduction: int, before: Tensor, after: Tensor) -> list[Observation]:
-        """The pictures taken nearest to the time of a frame, without those of films that have ended.
+        """The image of each film closest in time to a frame, without films that have ended.
 
         `before` and `after` are the motions of the objects from the previous frame and to the next one.
         """
@@ -92,7 +92,7 @@ class Tracker:
         return seen
 
     def _picture(self, i: int, k: int) -> Float[Tensor, "h w c"]:
-        """Frame k of film i at the brightness of the scene, with its painted labels where any film has some."""
+        """Frame k of film i at the brightness of the scene, with painted labels if any film has label images."""
         film = self.films[i]
         image = film.frames[k].to(self.device).float() / 255 / self.gains[i]
         if self.synthesiser.paint is None:
@@ -104,25 +104,25 @@ class Tracker:
         self, frame: int, steps: dict[int, int], poses: Poses, motion: tuple[Tensor, Tensor],
         fixed: Tensor | None = None,
     ) -> Poses:  # fmt: skip
-        """The poses in a frame from poses nearby; `fixed` objects stay."""
+        """The poses in a frame, starting from nearby poses; `fixed` objects keep theirs."""
         levels = [(self.observe(frame, reduction, *motion), count) for reduction, count in steps.items()]
         return align(self.synthesiser, levels, poses, self.scale, fixed)
 
     def judge(self, frame: int, poses: Poses, motion: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Confidence and number of pixels of each object in a frame."""
+        """Confidence and number of expected pixels of each object in a frame."""
         found = differences(self.synthesiser, self.observe(frame, JUDGING, *motion), poses)
         return confidences(found, self.tolerance)
 
     def learn(self, frame: int, poses: Poses, motion: tuple[Tensor, Tensor], followed: Tensor) -> None:
-        """Colours of what was not seen before, from the pictures of a frame, of objects that were followed to it."""
+        """Learn the colours of previously unseen sides of the objects that were `followed` up to this frame."""
         self.colours.learn(self.observe(frame, 1, *motion), poses, followed)
 
 
 def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"], timed: bool = False) -> TrackedMotion:
-    """The motion of all objects from their places in the scene, with confidences.
+    """Track all objects from their positions in the scene.
 
-    `gravity` is in scene units / frame^2. Objects are released from rest, which tells when each film starts, unless
-    this is known (`timed`).
+    `gravity` is in scene units / frame^2. If the starts of the films are not exactly known (not `timed`), they are
+    corrected using the fact that the objects are released from rest.
     """
     track = first_pass(tracker, frames, gravity)
     if timed:
@@ -137,12 +137,12 @@ def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"], timed: bo
 
 
 def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> TrackedMotion:
-    """Frame by frame, from poses extrapolated at constant velocity. What is lost is searched for in each frame."""
+    """Track frame by frame from poses extrapolated at constant velocity, searching for lost objects in each frame."""
     rest, velocity = tracker.rest, tracker.still
     share, number = tracker.judge(0, rest, (velocity, velocity))
     poses, shares, pixels = [rest], [share], [number]
-    last, missing = rest, torch.zeros_like(velocity[:, 0])  # where last seen, and how many frames ago
-    streak = missing  # for how many frames it has been seen
+    last, missing = rest, torch.zeros_like(velocity[:, 0])  # pose when last seen, and number of frames since then
+    streak = missing  # number of consecutive frames in which each object has been seen
     for frame in tqdm(range(1, frames), desc="tracking", unit="frame", leave=False):
         away, motion, usual = missing.cpu() > 0, (velocity, velocity), _usual(torch.stack(shares))
         n = (missing + 1)[:, None]
@@ -164,7 +164,7 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
                 found, share = again, now
         lost = (share == 0).to(tracker.device)
         step = last.step_to(found) / n
-        step[missing > 0, :3] = 0  # how often it turned is not known
+        step[missing > 0, :3] = 0  # the number of turns made while lost is unknown
         velocity = torch.where(lost[:, None], velocity, step)
         poses.append(_choose(lost, last, found))
         shares.append(share)
@@ -177,10 +177,10 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
 def fitted_seen(
     tracker: Tracker, frame: int, steps: dict[int, int], start: Poses, motion: tuple[Tensor, Tensor]
 ) -> tuple[Poses, Tensor, Tensor]:
-    """The poses of the objects that are seen in a frame, from poses nearby, with confidences and numbers of pixels.
+    """The poses of visible objects in a frame, starting from nearby poses, with confidences and numbers of pixels.
 
-    What the pictures do not confirm is taken out of sight and the others are fitted again: drawn at a wrong place, it
-    would hide them.
+    Objects that the images do not confirm are hidden and the others fitted again, since objects rendered at wrong
+    places would occlude them.
     """
     found = tracker.fit(frame, steps, start, motion)
     share, number = tracker.judge(frame, found, motion)
@@ -193,7 +193,7 @@ def fitted_seen(
 
 
 def from_release(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
-    """The track without gaps, from the release as it is seen in it; the films start that much later."""
+    """The track without gaps, shifted to begin at the release detected in it; film starts are shifted accordingly."""
     late = release_time(track)
     log.debug("released %.2f frames later than assumed", late)
     tracker.films = [replace(film, start=film.start + late) for film in tracker.films]
@@ -201,7 +201,7 @@ def from_release(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
 
 
 def release_time(track: TrackedMotion) -> float:
-    """When the objects that fall at the start were released [frames]: the square root of their drop grows linearly."""
+    """Release time of the objects that fall at the start [frames]: the square root of their drop grows linearly."""
     times = []
     drop = track.poses.centre[0, :, 2] - track.poses.centre[..., 2]
     for i in range(drop.shape[1]):
@@ -214,29 +214,29 @@ def release_time(track: TrackedMotion) -> float:
         design = torch.stack([used.float(), torch.ones(len(used))], 1)
         slope, offset = torch.linalg.lstsq(design, fallen[used][:, None]).solution[:, 0].tolist()
         misfit = float((design @ torch.tensor([slope, offset]) - fallen[used]).abs().max())
-        if slope > 0 and misfit < MAX_MISFIT * slope:  # it falls freely
+        if slope > 0 and misfit < MAX_MISFIT * slope:  # free fall
             times.append(-offset / slope)
     return float(torch.tensor(times).median().clamp(-1, 1)) if times else 0.0
 
 
 def _shifted(poses: Poses, late: float) -> Poses:
-    """The poses at times `late` frames later, linear between frames; those before the first frame are the first."""
+    """The poses `late` frames later, interpolated linearly; times before the first frame give its poses."""
     last = len(poses.centre) - 1
     time = (torch.arange(last + 1) + late).clamp(0, last)
-    time[0] = 0  # at rest
+    time[0] = 0  # the objects are at rest in the first frame
     at = time.floor().long().clamp(max=max(last - 1, 0))
     part = (time - at)[:, None, None].to(poses.centre)
     return poses[at].moved(part * poses[at].step_to(poses[(at + 1).clamp(max=last)]))
 
 
 def _usual(shares: Float[Tensor, "t o"]) -> Float[Tensor, "o"]:
-    """The mean confidence of each object where it was seen; 1 where it never was."""
+    """The mean confidence of each object over the frames in which it was seen; 1 if it was never seen."""
     seen = shares > 0
     return torch.where(seen.any(0), shares.sum(0) / seen.sum(0).clamp_min(1), 1.0)
 
 
 def lasting(shares: Float[Tensor, "t o"]) -> Float[Tensor, "t o"]:
-    """The confidences, 0 where an object was seen for fewer than LASTING frames between frames in which it was lost."""
+    """The confidences, set to 0 where an object was seen for fewer than LASTING frames between lost frames."""
     kept = shares.clone()
     for i in range(shares.shape[1]):
         seen = (shares[:, i] > 0).tolist()
@@ -250,13 +250,13 @@ def lasting(shares: Float[Tensor, "t o"]) -> Float[Tensor, "t o"]:
 
 
 def _choose(mask: Tensor, yes: Poses, no: Poses) -> Poses:
-    """The poses `yes` of the objects in the mask, and `no` of the others."""
+    """`yes` for the objects in the mask, `no` for the others."""
     return Poses(torch.where(mask[:, None, None], yes.rotation, no.rotation),
                  torch.where(mask[:, None], yes.centre, no.centre))  # fmt: skip
 
 
 def motions(track: TrackedMotion, frame: int) -> tuple[Tensor, Tensor]:
-    """The motions from the frame before, and to the frame after; at either end the same twice."""
+    """The motions from the previous frame and to the next frame; at both ends of the track, the same motion twice."""
     p, last = track.poses, len(track.poses.centre) - 1
     before = p[frame - 1].step_to(p[frame]) if frame > 0 else None
     after = p[frame].step_to(p[frame + 1]) if frame < last else before
@@ -264,14 +264,14 @@ def motions(track: TrackedMotion, frame: int) -> tuple[Tensor, Tensor]:
 
 
 def refined(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
-    """The track with every pose fitted again, with the motions between frames as they are known now."""
+    """Fit every pose of the track again, using the now known motions between frames."""
     rotation, centre = track.poses.rotation.clone(), track.poses.centre.clone()
     shares, pixels = track.confidence.clone(), track.pixels.clone()
     now, usual = replace(track, poses=Poses(rotation, centre)), _usual(track.confidence)
     for frame in tqdm(range(1, len(centre)), desc="refining", unit="frame", leave=False):
         motion = motions(now, frame)
         found, share, pixels[frame] = fitted_seen(tracker, frame, REFINING, now.poses[frame], motion)
-        doubtful = (shares[frame] == 0) & (share < CERTAIN * usual)  # it may be turned wrongly
+        doubtful = (shares[frame] == 0) & (share < CERTAIN * usual)  # its rotation may be wrong
         shares[frame] = torch.where(doubtful, 0.0, share)
         found = _choose((shares[frame] == 0).to(tracker.device), now.poses[frame], found)
         rotation[frame], centre[frame] = found.rotation, found.centre
@@ -279,7 +279,7 @@ def refined(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
 
 
 def retimed(tracker: Tracker, track: TrackedMotion, reduction: int) -> list[Film]:
-    """The films with the starts that explain the differences along the motion best; their mean stays."""
+    """Correct the film starts such that they explain the differences along the motion best; their mean is unchanged."""
     films = tracker.films
     for _ in range(RETIMING_STEPS):
         late = _lateness(tracker, track, reduction)
@@ -291,7 +291,7 @@ def retimed(tracker: Tracker, track: TrackedMotion, reduction: int) -> list[Film
 
 
 def _lateness(tracker: Tracker, track: TrackedMotion, reduction: int) -> Float[Tensor, "c"]:
-    """How much later each film's pictures were taken than assumed [frames], by a step of Gauss and Newton's method."""
+    """How much later than assumed each film's images were taken [frames], by one Gauss-Newton step."""
     along, square = torch.zeros(len(tracker.films)), torch.full((len(tracker.films),), 1e-9)
     for frame in range(1, len(track.confidence)):
         motion = motions(track, frame)
@@ -309,7 +309,7 @@ def _lateness(tracker: Tracker, track: TrackedMotion, reduction: int) -> Float[T
 
 
 def interpolated(track: TrackedMotion) -> Poses:
-    """The poses, with those of lost frames interpolated between those before and after."""
+    """The poses, with those of lost frames interpolated between the neighbouring known frames."""
     seen = track.confidence > 0
     t = torch.arange(len(seen))[:, None].expand_as(seen)
     before = torch.where(seen, t, -1).cummax(0).values

@@ -1,4 +1,4 @@
-"""Rigid motions of several objects about their centres at rest."""
+"""Rigid poses of several objects about their centres at rest."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from stages.core.geometry.rotations import matrix, quaternion
 
 @dataclass(frozen=True)
 class Poses:
-    """Each object turned about its centre at rest, which is moved to `centre`; a point x goes to
-    rotation (x - rest centre) + centre."""
+    """Rotation of each object about its centre at rest, and position of this centre.
+
+    A point x moves to rotation (x - rest centre) + centre.
+    """
 
     rotation: Float[Tensor, "*b o 3 3"]
     centre: Float[Tensor, "*b o 3"]  # [scene units]
@@ -25,7 +27,7 @@ class Poses:
         return Poses(self.rotation[index], self.centre[index])
 
     def place(self, arm: Float[Tensor, "*b p 3"], row: Int[Tensor, "p"]) -> Float[Tensor, "*b p 3"]:
-        """Points of the objects `row`, given by their offsets from the centres at rest."""
+        """Positions of points of the objects `row`, given as offsets from the centres at rest."""
         return (self.rotation[..., row, :, :] @ arm[..., None])[..., 0] + self.centre[..., row, :]
 
     def to(self, device: str) -> Poses:
@@ -42,23 +44,23 @@ class Poses:
         return Poses(torch.stack([p.rotation for p in poses]), torch.stack([p.centre for p in poses]))
 
     def moved(self, step: Float[Tensor, "*b o 6"]) -> Poses:
-        """The poses after a turn [rad] and a displacement [scene units] of each object."""
+        """The poses after an additional rotation [rad] and displacement [scene units] of each object."""
         return Poses(rotation_of(step[..., :3]) @ self.rotation, self.centre + step[..., 3:])
 
     def step_to(self, other: Poses) -> Float[Tensor, "*b o 6"]:
-        """The turn [rad] and displacement that lead from these poses to others."""
+        """Rotation [rad] and displacement [scene units] that lead from these poses to `other`."""
         turn = rotation_vector(other.rotation @ self.rotation.mT)
         return torch.cat([turn, other.centre - self.centre], -1)
 
 
 def rotation_of(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """The rotation about an axis by its length [rad]."""
+    """The rotation matrix of a rotation vector, whose length is the angle [rad]."""
     half = vector.norm(dim=-1, keepdim=True) / 2
     return matrix(torch.cat([half.cos(), vector / 2 * torch.sinc(half / torch.pi)], -1))
 
 
 def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """The axis of a rotation times its angle [rad], the inverse of `rotation_of` up to half a turn."""
+    """The rotation vector (axis times angle [rad]) of a rotation, the inverse of `rotation_of` up to half a turn."""
     q = quaternion(R)
     length = q[..., 1:].norm(dim=-1, keepdim=True)
     angle = 2 * torch.atan2(length, q[..., :1])

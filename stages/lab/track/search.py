@@ -1,4 +1,4 @@
-"""Find an object that was lost: where several pictures show something that the rest of the scene does not explain."""
+"""Search for a lost object where several images show something that the rest of the scene does not explain."""
 
 from __future__ import annotations
 
@@ -18,34 +18,35 @@ from stages.lab.track.synthesis import MASK_CONTRAST
 if TYPE_CHECKING:
     from stages.lab.track.follow import Tracker
 
-COARSE = 4  # reduction of the pictures
-SEARCHING = {8: 10, 4: 5}  # largest number of steps by reduction, coarse to fine: starts are up to 30 degrees off
-MAX_REACH = 12  # half width of the grid of places [half sizes of the object]
-SPREAD = 0.15  # of that share below the highest
-MIN_VIEWS = 3  # pictures that must show a place
-MIN_SUPPORT = 0.7  # share of the pictures that must show something unexplained at a place
-ROTATIONS = 72  # that are tried
-STARTS = 4  # rotations from which the object is aligned, the best of all tried
-DISTINCT = 30.0  # angle from which two rotations are not the same [degrees]
-DIFFERENT = 0.5  # difference of two poses' renderings from which a pixel tells them apart [scale of the residuals]
-MIN_DIFFERENT = 24  # such pixels of all pictures
-PREFERRED = 0.65  # share of them in which the best pose must be nearer to the picture than another rotation
-VIEWS = 3  # pictures in which rotations are compared
-LIKE = 0.15  # difference from the nearest colour of an object up to which a pixel may show it
-AWAY = 1e4  # where an object is not seen [scene units]
+COARSE = 4  # image reduction in the search
+SEARCHING = {8: 10, 4: 5}  # maximum number of steps by image reduction, coarse to fine: starts are up to 30 degrees off
+MAX_REACH = 12  # half width of the grid of candidate positions [half object sizes]
+SPREAD = 0.15  # positions count if their support is at most this much below the highest
+MIN_VIEWS = 3  # number of images in which a position must be visible
+MIN_SUPPORT = 0.7  # smallest fraction of the images that must show something unexplained at a position
+ROTATIONS = 72  # number of rotations tried
+STARTS = 4  # number of best rotations from which the object is aligned
+DISTINCT = 30.0  # angle from which two rotations count as different [degrees]
+DIFFERENT = 0.5  # difference of the renderings of two poses from which a pixel distinguishes them [residual scales]
+MIN_DIFFERENT = 24  # smallest number of distinguishing pixels, over all images
+PREFERRED = 0.65  # fraction of these pixels in which the best pose must fit better than another rotation
+VIEWS = 3  # number of images with which rotations are compared
+LIKE = 0.15  # largest difference of a pixel that may show the object from the object's palette [colours from 0 to 1]
+AWAY = 1e4  # coordinates of an object that is moved out of view [scene units]
 
 
 class Sighting(NamedTuple):
     """An object that was found again."""
 
     poses: Poses  # of all objects
-    distinct: bool  # whether the pictures tell it from all other rotations that were tried
+    distinct: bool  # whether the images distinguish the pose from all other rotations that were tried
 
 
 def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor, missing: int) -> Sighting | None:
-    """Object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen.
+    """The best pose of object i, which was last seen `missing` frames ago; None if it is not visible.
 
-    `poses` holds where it was last seen: where an object went of which the last frames saw little is not known.
+    The search is centred on its last known position in `poses`, since the velocity of an object that was barely visible
+    before it was lost is unreliable.
     """
     seen = tracker.observe(frame, COARSE, velocity, velocity)
     gone = without(poses, torch.arange(len(poses.centre), device=tracker.device) == i)
@@ -59,7 +60,7 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
         start.rotation[i], start.centre[i] = turn.to(places) @ poses.rotation[i], places.mean(0)
         starts.append((_cost(tracker, some, start), start))
     starts.sort(key=lambda start: start[0])
-    if starts[0][0] >= _cost(tracker, some, gone):  # the pictures are explained better without the object
+    if starts[0][0] >= _cost(tracker, some, gone):  # the images are explained better without the object
         return None
     others = torch.arange(len(poses.centre), device=tracker.device) != i
     aligned = [tracker.fit(frame, SEARCHING, start, (velocity, velocity), others) for _, start in starts[:STARTS]]
@@ -74,7 +75,7 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
 
 
 def half_turns(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3 3"]:
-    """Half turns about the principal axes of points, which hardly change an elongated or flat object's outline."""
+    """Half turns about the principal axes of points, which hardly change the outline of a long or flat object."""
     axes = torch.linalg.eigh(points.mT @ points).eigenvectors.mT[..., None]
     return 2 * axes @ axes.mT - torch.eye(3).to(points)
 
@@ -85,7 +86,7 @@ def _turned(a: Poses, b: Poses, i: int) -> float:
 
 
 def _preferred(tracker: Tracker, seen: list[Observation], best: Poses, rival: Poses, scale: float) -> float:
-    """Of the pixels that tell two poses apart, the share in which the first is nearer to the picture; 0 if few do."""
+    """Fraction of the pixels that distinguish two poses in which `best` fits better; 0 if there are too few pixels."""
     nearer, different = 0, 0
     for o in seen:
         one, other = (o.draw(tracker.synthesiser, p) for p in (best, rival))
@@ -101,14 +102,14 @@ def _cost(tracker: Tracker, seen: list[Observation], poses: Poses) -> float:
 
 
 def without(poses: Poses, mask: Bool[Tensor, "o"]) -> Poses:
-    """The poses with the objects in the mask out of sight."""
+    """The poses with the objects in the mask moved out of view."""
     return Poses(poses.rotation, torch.where(mask[:, None].to(poses.centre.device), AWAY, poses.centre))
 
 
 def _places(
     tracker: Tracker, seen: list[Observation], gone: Poses, i: int, middle: Float[Tensor, "3"], missing: int
 ) -> Float[Tensor, "n 3"]:
-    """Places around where an object is expected, at which most pictures show something unexplained in its colours."""
+    """Positions around `middle` where most images show something unexplained that has the object's colours."""
     size, limit = tracker.synthesiser.sizes[i], tracker.scale[i]
     reach = min(MAX_REACH, 4 + 2 * missing)
     steps = torch.arange(-reach, reach + 1, device=tracker.device) * size / 2
@@ -119,7 +120,7 @@ def _places(
         drawn = o.draw(tracker.synthesiser, gone)
         off = o.difference(drawn).square().mean(-1).sqrt()
         like = (o.image[..., None, :3] - palette).square().mean(-1).sqrt().amin(-1) < LIKE
-        if paint is not None:  # nan where label images say nothing, which is not far
+        if paint is not None:  # unknown label pixels are nan and do not exclude a position
             like &= ~((o.image[..., 3:] - paint[i]).norm(dim=-1) > MASK_CONTRAST / 2)
         vote, counted = _looked_up((off > limit) & like, drawn.label < 0, o, places)
         votes, views = votes + vote, views + counted
@@ -130,7 +131,7 @@ def _places(
 def _looked_up(
     mask: Bool[Tensor, "h w"], free: Bool[Tensor, "h w"], o: Observation, places: Float[Tensor, "n 3"]
 ) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
-    """The mask where the places are seen, and whether they are inside the picture and nothing may hide them."""
+    """The mask at the positions' pixels, and whether each position is inside the image and not occluded."""
     height, width = mask.shape
     x, y = (project(places, o.camera.viewmat, o.camera.K) / o.reduction).floor().long().unbind(1)
     inside = (depths(places, o.camera.viewmat) > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -139,7 +140,7 @@ def _looked_up(
 
 
 def spread_rotations(count: int) -> Float[Tensor, "n 3 3"]:
-    """Rotations evenly spread, the same for every call.
+    """Evenly distributed rotations; deterministic.
 
     Source: Alexa 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
     """

@@ -1,7 +1,7 @@
-"""A stand-in for real recordings: toys that fall onto a table, filmed by fixed cameras, with their true motion.
+"""Synthetic substitute for real recordings: toys that fall onto a table, filmed by fixed cameras, with known motion.
 
-Films have noise and motion blur, start at different times, by thirds of a frame; one of them breaks off, and something
-covers one of the objects for some frames.
+The films have noise and motion blur and start at different times, in thirds of a frame. One film ends early, and an
+occluder covers one of the objects for some frames.
 """
 
 from __future__ import annotations
@@ -32,51 +32,51 @@ from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWr
 from stages.lab.assets.toys import falling_toys
 from stages.simulate.options import ENGINES, SimulateOptions
 
-SUBSTEPS = 6  # simulated steps in a frame
-EXPOSURE = (-1, 0, 1)  # steps about the middle of a frame that its picture shows
-BEFORE = (6, 12)  # frames that a film shows before the release, at least and at most
-AFTER = 6  # frames that a film shows after the motion
-STIFF_TOYS = (1, 2, 3)  # of `falling_toys`
-THINNED = 5  # every so many Gaussians of the toys are drawn
-KEYPOINTS = 64
+SUBSTEPS = 6  # simulated steps per frame
+EXPOSURE = (-1, 0, 1)  # simulated steps averaged in an image, relative to the middle of its frame
+BEFORE = (6, 12)  # minimum and maximum number of film frames before the release
+AFTER = 6  # number of film frames after the motion
+STIFF_TOYS = (1, 2, 3)  # indices in `falling_toys`, counted from 1
+THINNED = 5  # only every n-th Gaussian of a toy is kept
+KEYPOINTS = 64  # per object
 
 
 @dataclass(frozen=True)
 class StandInOptions:
-    """What is filmed and how."""
+    """Content and quality of the films."""
 
     objects: int = 3
     cameras: int = 10
-    width: int = 240  # of the films [px]; the height is three quarters
+    width: int = 240  # of the films [px]; the height is three quarters of it
     frames: int = 50  # from the release on
     fps: float = 50.0
-    noise: float = 0.02  # standard deviation of a channel, of 0..1
-    broken: bool = True  # the last film breaks off half way
-    hidden: int = 10  # frames for which something covers the first object; 0: none
+    noise: float = 0.02  # standard deviation of a colour channel (0..1)
+    broken: bool = True  # the last film ends half way
+    hidden: int = 10  # number of frames in which the first object is covered; 0: none
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """A scene at the release, its true motion, and when each camera films."""
+    """A scene at the release, its true motion, and the start of each film."""
 
     scene: Scene
-    starts: dict[str, float]  # number of the frame that each film shows at the release, with fractions
+    starts: dict[str, float]  # frame number of each film at the release, with fractions
     keypoints: Keypoints
-    states: list[FrameState]  # SUBSTEPS in a frame
+    states: list[FrameState]  # SUBSTEPS per frame
     hidden: range  # frames in which the first object is covered
     options: StandInOptions
 
 
 def make_stand_in(options: StandInOptions) -> StandIn:
-    """A random scene of stiff toys in the air, and its motion by the rigid engine."""
+    """A random scene of stiff toys in the air, with their motion simulated by the rigid engine."""
     rng = random.Random(options.seed)
     scene = _scene(options, rng)
     keypoints = choose_keypoints(scene, KEYPOINTS, options.seed)
     simulate = SimulateOptions(
         steps=options.frames * SUBSTEPS, dt=1 / options.fps / SUBSTEPS, engine="rigid", seed=options.seed, device="cpu"
     )
-    free = replace(scene, cameras=None)  # nothing holds the objects, which objects of photos are held by
+    free = replace(scene, cameras=None)  # objects of photographed scenes are assumed to be at rest
     states = list(load(ENGINES["rigid"].rollout)(free, keypoints, ForcePrompts(), simulate))
     starts = {name: rng.randint(*BEFORE) + rng.randrange(3) / 3 for name in scene.cameras.names}
     first = rng.randint(5, max(5, options.frames // 2 - options.hidden))
@@ -84,7 +84,7 @@ def make_stand_in(options: StandInOptions) -> StandIn:
 
 
 def _scene(options: StandInOptions, rng: random.Random) -> Scene:
-    """Toys of random kinds, turned at random, above each other and beside each other."""
+    """Random toys with random rotations, stacked in columns in the air."""
     toys = falling_toys()
     parts, objects = [thinned(toys.gaussians[toys.gaussians.object_id == 0])], []
     kinds = rng.sample(STIFF_TOYS, min(options.objects, len(STIFF_TOYS)))
@@ -94,7 +94,7 @@ def _scene(options: StandInOptions, rng: random.Random) -> Scene:
         toy = thinned(toys.gaussians[toys.gaussians.object_id == kind.id])
         centre = (toy.means.amin(0) + toy.means.amax(0)) / 2
         turn = matrix(torch.nn.functional.normalize(torch.randn(4, generator=generator), dim=0))
-        # columns of two, so that objects collide in the air and on the table
+        # columns of two toys, so that objects collide in the air and on the table
         column, row = divmod(id - 1, 2)
         at = torch.tensor([0.2 * column - 0.08 + rng.uniform(-0.03, 0.03), rng.uniform(-0.06, 0.06),
                            0.16 + 0.2 * row + rng.uniform(0, 0.04)])  # fmt: skip
@@ -113,13 +113,13 @@ def _scene(options: StandInOptions, rng: random.Random) -> Scene:
 
 
 def thinned(g: Gaussians) -> Gaussians:
-    """Fewer Gaussians, as much larger."""
+    """Every THINNED-th Gaussian, enlarged to cover the same area."""
     part = g[torch.arange(0, len(g), THINNED)]
     return replace(part, scales=part.scales * torch.tensor([THINNED**0.5, THINNED**0.5, 1.0]))
 
 
 def cameras_around(count: int, width: int, rng: random.Random) -> Cameras:
-    """Cameras around the table, at different heights, for pictures of this width [px] and three quarters of it."""
+    """Cameras around the table at different heights, with images of width [px] by three quarters of it."""
     azimuth = torch.tensor([2 * torch.pi * (i + rng.uniform(-0.2, 0.2)) / count for i in range(count)])
     height = torch.tensor([rng.uniform(0.25, 0.75) for _ in range(count)])
     eyes = torch.stack([1.1 * azimuth.cos(), 1.1 * azimuth.sin(), height], 1)
@@ -130,7 +130,7 @@ def cameras_around(count: int, width: int, rng: random.Random) -> Cameras:
 
 
 def write_photos(options: StandInOptions, folder: Path) -> None:
-    """A photo of each camera at the release, with noise."""
+    """Write a noisy photo from each camera at the release."""
     scene, generator = _scene(options, random.Random(options.seed)), torch.Generator().manual_seed(options.seed)
     folder.mkdir(parents=True, exist_ok=True)
     views = zip(scene.cameras.viewmats, scene.cameras.Ks, scene.cameras.sizes.tolist(), strict=True)
@@ -141,7 +141,7 @@ def write_photos(options: StandInOptions, folder: Path) -> None:
 
 
 def write_truth(stand_in: StandIn, out: Path) -> None:
-    """The true motion from the release on, at the frame rate of the films."""
+    """Write the true motion from the release on, at the frame rate of the films."""
     o, scene = stand_in.options, stand_in.scene
     info = SimulationInfo(1 / o.fps, (0.0, 0.0, -9.81), "rigid")
     binding = bind_gaussians(scene, stand_in.keypoints)
@@ -151,7 +151,7 @@ def write_truth(stand_in: StandIn, out: Path) -> None:
 
 
 def film(stand_in: StandIn, camera: int) -> Iterator[Float[Tensor, "h w 3"]]:
-    """The frames that a camera takes, with noise and motion blur."""
+    """The frames of a camera's film, with noise and motion blur."""
     o, cameras = stand_in.options, stand_in.scene.cameras
     start = stand_in.starts[cameras.names[camera]]
     generator = torch.Generator().manual_seed(1000 * o.seed + camera)
@@ -167,7 +167,7 @@ def film(stand_in: StandIn, camera: int) -> Iterator[Float[Tensor, "h w 3"]]:
 
 
 def _picture(stand_in: StandIn, camera: int, step: int) -> Float[Tensor, "h w 3"]:
-    """The scene at a moment, without noise."""
+    """A noise-free rendering of the scene at one simulated step."""
     scene, states = stand_in.scene, stand_in.states
     state, g = states[min(max(step, 0), len(states) - 1)], scene.gaussians
     parts = [g[g.object_id == 0]]
@@ -185,7 +185,7 @@ def _picture(stand_in: StandIn, camera: int, step: int) -> Float[Tensor, "h w 3"
 
 
 def _covered(image: Tensor, thing: Gaussians, V: Tensor, K: Tensor) -> Float[Tensor, "h w 3"]:
-    """The picture with a grey disc in front of a thing."""
+    """The image with a grey disc in front of the object."""
     xy = project(thing.means, V, K)
     centre = xy.mean(0)
     radius = (xy - centre).norm(dim=1).max() + 2
@@ -195,7 +195,7 @@ def _covered(image: Tensor, thing: Gaussians, V: Tensor, K: Tensor) -> Float[Ten
 
 
 def write_films(stand_in: StandIn, folder: Path) -> None:
-    """One video of each camera."""
+    """Write one video per camera."""
     folder.mkdir(parents=True, exist_ok=True)
     for camera, name in enumerate(stand_in.scene.cameras.names):
         with VideoWriter(folder / name, stand_in.options.fps) as video:
@@ -204,7 +204,7 @@ def write_films(stand_in: StandIn, folder: Path) -> None:
 
 
 def write_cameras(stand_in: StandIn, path: Path) -> None:
-    """The true cameras, as a nerfstudio transforms.json."""
+    """Write the true cameras as a nerfstudio transforms.json."""
     cameras, flip = stand_in.scene.cameras, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     frames = [{"file_path": name, "transform_matrix": (torch.linalg.inv(V.double()) @ flip).tolist()}
               for V, name in zip(cameras.viewmats, cameras.names, strict=True)]  # fmt: skip

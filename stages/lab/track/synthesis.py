@@ -1,4 +1,4 @@
-"""Pictures of the scene with its objects at given poses, and what they show in each pixel."""
+"""Rendering of a scene with its objects at given poses, with the object and 3D point seen in each pixel."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.track.poses import Poses
 
-MIN_ALPHA = 0.5  # opacity above which a pixel shows an object
-FAR = 1e6  # depth where there is nothing [scene units]
-PALETTE, PALETTE_ROUNDS = 24, 10  # clusters of an object's colours, and iterations in which they are found
-MASK_CONTRAST = 0.5  # between the label image of an object and its surroundings, where that of colours is 0 to 1
-BEHIND = 0.02  # how far an object may be behind the background's depth and still be drawn [of its depth]
+MIN_ALPHA = 0.5  # opacity above which a pixel counts as covered
+FAR = 1e6  # depth of empty pixels [scene units]
+PALETTE, PALETTE_ROUNDS = 24, 10  # number of colour clusters of an object, and of k-means iterations
+MASK_CONTRAST = 0.5  # contrast between an object and its surroundings in label channels; colours range from 0 to 1
+BEHIND = 0.02  # how far behind the background's depth an object is still drawn [fraction of that depth]
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera at one resolution, and the picture of what does not move."""
+    """A camera at one resolution, with a rendering of the static background."""
 
     viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
@@ -42,27 +42,27 @@ class Camera:
     def in_front(
         self, rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]
     ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-        """The picture with objects that were drawn over black, and where the background does not hide them."""
+        """Composite objects, rendered over black, over the background; also return the mask where they are in front."""
         front = (alpha > 0) & (depth < self.background_depth * (1 + BEHIND))
         return torch.where(front[..., None], rgb + (1 - alpha)[..., None] * self.background, self.background), front
 
 
 @dataclass(frozen=True)
 class Synthesis:
-    """A picture, and for each pixel the object whose motion changes it and the point of it that is seen there."""
+    """An image, and for each pixel the object whose motion changes it and the 3D point of it that is seen there."""
 
-    image: Float[Tensor, "h w c"]  # RGB, and with label images their painted labels
+    image: Float[Tensor, "h w c"]  # RGB, followed by painted labels if there are label images
     label: Int[Tensor, "h w"]  # row of the object, -1: background
-    moving: Int[Tensor, "h w"]  # the same, with the frontmost of the neighbours on outlines
-    point: Float[Tensor, "h w 3"]  # of the object in `moving`, in the world
-    depth: Float[Tensor, "h w"]  # of what `label` says
+    moving: Int[Tensor, "h w"]  # as `label`, but on outlines the nearest object among the neighbouring pixels
+    point: Float[Tensor, "h w 3"]  # visible point of the object in `moving`, in world coordinates
+    depth: Float[Tensor, "h w"]  # of the object or background in `label`
 
 
 class Synthesiser:
-    """Draws the objects of a scene at any poses in front of its background.
+    """Renders the objects of a scene at any poses in front of its background.
 
-    With `labelled`, pictures have three more channels: those of label images, in which each object has a value of its
-    own, so that outlines and what hides what are compared as colours are.
+    With `labelled`, images have three more channels for label images, in which each object has a distinct value, so
+    that outlines and occlusions are compared in the same way as colours.
     """
 
     def __init__(self, scene: Scene, device: str, labelled: bool = False):
@@ -80,13 +80,13 @@ class Synthesiser:
         self.paint = MASK_CONTRAST * spread_directions(len(ids)).to(device) if labelled else None
 
     def painted(self, label: Int[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-        """The channels of a label image: rows of objects, -1 for the background, -2 for what is not known (nan)."""
+        """The channels of a label image of object rows; -1: background, -2: unknown (becomes nan)."""
         values = torch.cat([self.paint, self.paint.new_full((1, 3), torch.nan), self.paint.new_zeros(1, 3)])
         return values[label.long()]
 
     @property
     def colours(self) -> Float[Tensor, "n 3"]:
-        """Of the Gaussians of the objects, without what depends on the view."""
+        """Colours of the Gaussians of the objects, without view-dependent terms."""
         return C0 * self.rest_gaussians.sh[:, 0] + 0.5
 
     def palette(self, i: int) -> Float[Tensor, "k 3"]:
@@ -94,7 +94,7 @@ class Synthesiser:
         return _palette(self.colours[self.row == i])
 
     def recolour(self, rows: Int[Tensor, "m"], colours: Float[Tensor, "m 3"]) -> None:
-        """Give Gaussians of the objects these colours, in all views."""
+        """Set the colours of Gaussians of the objects, equal for all view directions."""
         sh = self.rest_gaussians.sh.clone()
         sh[rows] = 0.0
         sh[rows, 0] = (colours - 0.5) / C0
@@ -105,7 +105,7 @@ class Synthesiser:
         return Poses(torch.eye(3, device=self.device).repeat(len(self.rest), 1, 1), self.rest.clone())
 
     def camera(self, viewmat: Tensor, K: Tensor, width: int, height: int) -> Camera:
-        """A camera, with the scene without its objects."""
+        """A camera with a rendering of the scene without its objects."""
         K, viewmat = K.to(self.device), viewmat.to(self.device)
         drawn = rasterise(self.background, viewmat[None], K[None], width, height, self.colour)
         depth = torch.where(drawn.alpha[0] > MIN_ALPHA, drawn.depth[0], FAR)
@@ -118,7 +118,7 @@ class Synthesiser:
         return replace(g, means=means, quats=multiply(quaternion(poses.rotation)[self.row], g.quats), sh=sh)
 
     def draw(self, camera: Camera, poses: Poses, reduction: int = 1) -> Synthesis:
-        """What a camera sees of the objects at these poses, at a whole fraction of its resolution."""
+        """What a camera sees with the objects at these poses, at its resolution divided by `reduction`."""
         g, (width, height) = self.objects(poses), camera.size
         rgb, alpha, depth, index, _ = visibility(g, camera.viewmat, camera.K, width, height)
         image, front = camera.in_front(rgb, alpha, depth)
@@ -128,7 +128,7 @@ class Synthesiser:
         depth = torch.where(seen, depth, camera.background_depth)
         middle = slice(reduction // 2, None, reduction)
         label, depth = label[middle, middle], depth[middle, middle]
-        # outlines move with what is in front
+        # pixels on an outline move with the object in front
         nearest, source = F.max_pool2d(-depth[None, None], 3, 1, 1, return_indices=True)
         source = source[0, 0]
         K = resize(camera.K, 1 / reduction, 1 / reduction)
@@ -137,12 +137,12 @@ class Synthesiser:
 
 
 def reduced(image: Float[Tensor, "h w c"], reduction: int) -> Float[Tensor, "h2 w2 c"]:
-    """The means of blocks of pixels."""
+    """Averages of square blocks of pixels."""
     return F.avg_pool2d(image.permute(2, 0, 1), reduction).permute(1, 2, 0) if reduction > 1 else image
 
 
 def _palette(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
-    """The centres of a few clusters of an object's colours (k-means): single odd colours have no cluster."""
+    """Cluster centres of an object's colours (k-means), without clusters of only a few outliers."""
     centre = colours[farthest_points(colours, PALETTE).to(colours.device)]
     for _ in range(PALETTE_ROUNDS):
         nearest = torch.cdist(colours, centre).argmin(1)
@@ -153,7 +153,7 @@ def _palette(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
 
 
 def spread_directions(count: int) -> Float[Tensor, "n 3"]:
-    """Unit vectors far from each other: a Fibonacci lattice on the sphere."""
+    """Evenly distributed unit vectors: a Fibonacci lattice on the sphere."""
     i = torch.arange(count)
     z, turn = 1 - (2 * i + 1) / count, i * torch.pi * (3 - 5**0.5)
     r = (1 - z * z).sqrt()
@@ -167,7 +167,7 @@ def _middle(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 def _points(
     viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], depth: Float[Tensor, "h w"], pixel: Int[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """The points of the world at these depths [scene units] behind these pixels."""
+    """The world points at these depths [scene units] in these pixels."""
     width = depth.shape[1]
     x, y = (pixel % width) + 0.5, (pixel // width) + 0.5
     ray = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(depth)], -1)

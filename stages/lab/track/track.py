@@ -29,9 +29,9 @@ GRAVITY = 9.81  # [m/s^2]
 
 
 def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator[str]:
-    """Follow the objects of a scene through films, write their motion, and yield a line for each object.
+    """Track the objects of a scene through films, write their motion, and yield a line for each object.
 
-    Raises InputError for a scene without objects or films, films of other cameras, and label images of other films.
+    Raises InputError for a scene without objects or film times, and for films or label images that do not match it.
     """
     check_output(Path(out), "trajectory")
     world, device = read_scene(scene), pick_device(options.device)
@@ -63,12 +63,12 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
 
 
 def rows_of(world: Scene, keypoints: Keypoints) -> Int[Tensor, "k"]:
-    """The row of each keypoint's object in the scene."""
+    """The scene row of the object that each keypoint belongs to."""
     return (keypoints.object_id[:, None] == torch.tensor([o.id for o in world.objects])).int().argmax(1)
 
 
 def check_objects(world: Scene, path: Path) -> None:
-    """Raise InputError for a scene without objects, or with one that has no Gaussians."""
+    """Raise InputError for a scene without objects, or with an object that has no Gaussians."""
     present = set(world.gaussians.object_id.unique().tolist())
     if not world.objects or (empty := [o.name for o in world.objects if o.id not in present]):
         what = f"{empty[0]} has no Gaussians" if world.objects else "it has no objects"
@@ -76,7 +76,7 @@ def check_objects(world: Scene, path: Path) -> None:
 
 
 def report(world: Scene, track: TrackedMotion) -> Iterator[str]:
-    """A line for each object: in how many frames it was seen, and where and why it was lost."""
+    """A line for each object: in how many frames it was seen, and when and why it was lost."""
     for i, o in enumerate(world.objects):
         share, pixels = track.confidence[:, i], track.pixels[:, i]
         seen = share > 0

@@ -1,1 +1,1 @@
-"""Scenes of cluttered tables, desks, shelves and floors with known labels: training data of the segmentation."""
+"""Scenes of cluttered tables, seats and floors with known labels, as training data for segmentation."""

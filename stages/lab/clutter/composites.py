@@ -1,8 +1,7 @@
-"""Objects of several parts, often of several colours: figures, soft toys, vehicles of bricks, stands, devices, plants,
-boards.
+"""Random objects of several parts: figures, soft toys, brick vehicles, stands, devices, plants, boards.
 
-They teach the segmentation network that what is joined by thin, bent or differently coloured parts can be one object.
-Shapes from one field (props.py) are mostly convex and of one texture.
+They teach the segmentation network that parts joined by thin or bent pieces, or of different colours, can be one
+object. The single-field shapes of props.py are mostly convex and have one texture.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from stages.lab.assets.signed_distance import Field, capsule, ellipsoid, posed, 
 from stages.lab.clutter.props import Prop, composite_prop, random_colour, random_paint
 
 Rng = np.random.Generator
-FIT = 0.5  # farthest coordinate of a part's centre line
-UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the y axis of a slab becomes the vertical
+FIT = 0.5  # largest coordinate of the centre line of a part
+UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotates the y axis of a shape to the vertical
 
 
 def make_composite(seed: int) -> Prop:
-    """A random object of several parts; deterministic."""
+    """A random object of several parts, determined by the seed."""
     rng = np.random.default_rng([seed, 11])
     names, shares = list(FAMILIES), np.array([family.share for family in FAMILIES.values()])
     name = names[rng.choice(len(names), p=shares / shares.sum())]
@@ -35,7 +34,7 @@ def make_composite(seed: int) -> Prop:
 
 
 def _paints(rng: Rng) -> Callable[[], Callable[[Tensor], Tensor]]:
-    """A source of paints for the parts: all alike, of a small palette, or each its own."""
+    """A source of paints for the parts: one for all, a small palette, or a different one for each."""
     kind, count = rng.uniform(), int(rng.integers(2, 5))
     palette = [random_paint(rng) for _ in range(1 if kind < 0.4 else count)]
     if kind > 0.85:
@@ -49,12 +48,12 @@ def _plain(rng: Rng) -> Callable[[Tensor], Tensor]:
 
 
 def _box(centre: np.ndarray, half: np.ndarray, edge: float) -> Field:
-    """A box with half sides along x, y, z, its edges rounded."""
+    """A box with the given half sides along x, y, z and rounded edges."""
     return slab(centre.tolist(), half.tolist(), edge, edge)
 
 
 def _limb(start: np.ndarray, length: float, thick: float, rng: Rng, drop: float) -> tuple[list[Field], np.ndarray]:
-    """Two bones from `start` in random directions, and where they end."""
+    """Two connected bones from `start` in random directions, and the end point."""
     fields, at = [], start
     for _ in range(2):
         step = rng.normal(size=3) * [1, 1, 0.6] - [0, 0, drop]
@@ -130,7 +129,7 @@ def _soft_toy(rng: Rng) -> list[PaintedPart]:
 
 
 def _bricks(rng: Rng) -> list[PaintedPart]:
-    """A vehicle or building of boxes that touch, with wheels."""
+    """A vehicle or building of adjoining boxes, with wheels."""
     paints = [_plain(rng) for _ in range(int(rng.integers(1, 5)))]
     edge, boxes = rng.uniform(0.002, 0.015), []
     for _ in range(int(rng.integers(4, 11))):
@@ -157,7 +156,7 @@ def _bricks(rng: Rng) -> list[PaintedPart]:
 
 
 def _stand(rng: Rng) -> list[PaintedPart]:
-    """A foot, a thin pole, and a panel, ball, ring or shade on it: screens, lamps, globes, tools on a stand."""
+    """A foot, a thin pole, and a panel, ball, ring or shade on top: screens, lamps, globes, tools on a stand."""
     paint, low, high = _paints(rng), -0.45, rng.uniform(-0.1, 0.25)
     foot, thick = rng.uniform(0.1, 0.25), rng.uniform(0.01, 0.035)
     base = revolved([(0, low), (foot, low), (foot, low + 0.03), (0, low + 0.03)], 0.005)
@@ -188,7 +187,7 @@ def _stand(rng: Rng) -> list[PaintedPart]:
 
 
 def _device(rng: Rng) -> list[PaintedPart]:
-    """A housing with knobs, keys, a handle or handset on it: telephones, clocks, tools, toys."""
+    """A housing with knobs, keys, a handle or a handset: telephones, clocks, tools, toys."""
     paint, half = _paints(rng), np.array([rng.uniform(0.2, 0.45), rng.uniform(0.15, 0.4), rng.uniform(0.03, 0.15)])
     parts = [PaintedPart(_box(np.zeros(3), half, rng.uniform(0.005, 0.025)), paint())]
     for _ in range(int(rng.integers(1, 9))):
@@ -234,12 +233,12 @@ def _board(rng: Rng) -> list[PaintedPart]:
 
 
 class Family(NamedTuple):
-    """Objects of one kind."""
+    """A kind of object: its generator and how it is used."""
 
     make: Callable[[Rng], list[PaintedPart]]
-    sizes: tuple[float, float]  # [camera distance]
-    flat: bool
-    share: float  # of the objects
+    sizes: tuple[float, float]  # range of the longest side [camera distances]
+    flat: bool  # lies on its largest side
+    share: float  # relative frequency
 
 
 FAMILIES = {

@@ -1,4 +1,4 @@
-"""Crumpled blankets, clothes and cushions under and among the things of a scene: uneven ground, not objects."""
+"""Crumpled blankets, clothes and cushions under and among the objects: uneven ground that is not an object."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from torch import Tensor
 from stages.lab.assets.shapes import Surface, noise
 
 Rng = np.random.Generator
-DRAPE_SHARE = 0.4  # of scenes
-CELLS = 48  # heights along each side
-RIM = 0.002  # height above which there is cloth [camera distance]
+DRAPE_SHARE = 0.4  # fraction of scenes with drapes
+CELLS = 48  # grid points along each side of the height field
+RIM = 0.002  # height above which a point is covered by cloth [camera distances]
 
 
 @dataclass(frozen=True)
 class Drape:
-    """Heights over a rectangle, zero where there is no cloth; lengths in camera distances."""
+    """A height field over a rectangle, zero where there is no cloth; lengths in camera distances."""
 
     heights: Float[Tensor, "CELLS CELLS"]  # [row of y, column of x]
-    half: tuple[float, float]
-    at: tuple[float, float]
-    yaw: float
+    half: tuple[float, float]  # half sides of the rectangle
+    at: tuple[float, float]  # its centre
+    yaw: float  # rotation about z [rad]
 
     def local(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Coordinates -1..1 within the rectangle."""
+        """Coordinates in the rectangle, from -1 to 1."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         turned = (xy - torch.tensor(self.at)) @ torch.tensor([[c, -s], [s, c]])
         return turned / torch.tensor(self.half)
 
     def height(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-        """Heights at points of the plane, bilinear between those of the grid, 0 outside."""
+        """Heights at points of the plane, interpolated bilinearly; 0 outside the rectangle."""
         grid = self.local(xy)[None, None]
         return torch.nn.functional.grid_sample(
             self.heights[None, None], grid, padding_mode="zeros", align_corners=True
         ).flatten()
 
     def surface(self, spacing: float) -> Surface:
-        """Points on the cloth, and normals."""
+        """Points on the cloth with normals, on a grid of this spacing."""
         reach = math.hypot(*self.half)
         line = torch.arange(-reach, reach, spacing)
         xy = torch.cartesian_prod(line, line) + torch.tensor(self.at)
@@ -53,7 +53,7 @@ class Drape:
 
 
 def random_drapes(used: tuple[float, float], rng: Rng) -> list[Drape]:
-    """None in most scenes, else one or two within `used`, half the sides of where things are dropped."""
+    """No drapes in most scenes, otherwise one or two within `used`, the half sides of the area where objects drop."""
     if rng.uniform() > DRAPE_SHARE:
         return []
     return [_drape(used, rng) for _ in range(int(rng.integers(1, 3)))]
@@ -75,7 +75,7 @@ def _drape(used: tuple[float, float], rng: Rng) -> Drape:
     rim = ((0.92 - outline) / rng.uniform(0.1, 0.4)).clamp(0, 1)
     inner = rim * rim * (3 - 2 * rim)
     folds = sum(k * (1 - (2 * waves(size, n, 2.5) - 1).abs()) ** 2 for n, size, k in ((1, 0.16, 1.0), (2, 0.07, 0.4)))
-    body = rng.uniform(0, 0.1) * (1 - 0.5 * (u * u + v * v)).clamp(0, 1)  # a cushion
+    body = rng.uniform(0, 0.1) * (1 - 0.5 * (u * u + v * v)).clamp(0, 1)  # bulge of a cushion
     heights = inner * (0.006 + math.exp(rng.uniform(math.log(0.004), math.log(0.05))) * folds + body)
     at = (rng.uniform(-0.6, 0.6) * used[0], rng.uniform(-0.6, 0.6) * used[1])
     return Drape(heights.contiguous(), half, at, rng.uniform(0, 2 * math.pi))

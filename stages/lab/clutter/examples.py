@@ -1,4 +1,4 @@
-"""Labelled surfels of a reconstruction: what the segmentation network is trained on, and their files."""
+"""Training examples of the segmentation network: labelled surfels of a reconstruction, and their files."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from stages.lab.clutter.reconstruction import true_labels
 
 @dataclass(frozen=True)
 class Example:
-    """ScenePoints of a reconstruction and the true object of each: 0 surface, 1... objects, -1 floaters."""
+    """Surfels of a reconstruction and the true object of each: 0 surface, 1... objects, -1 floaters."""
 
     surfels: ScenePoints
     labels: Int[Tensor, "n"]
 
 
 def labelled(made: Scene, truth: Scene) -> Example:
-    """Surfels of the reconstruction `made`, with the labels of the true scene."""
+    """Surfels of the reconstruction `made`, labelled from the true scene."""
     surfels, index, _ = scene_surfels(made)
     return Example(surfels, true_labels(made, truth)[index])
 
 
 def write_example(path: Path, example: Example) -> None:
-    """A file of an example (.safetensors), in half precision."""
+    """Write an example to a .safetensors file, in half precision."""
     table = {name: getattr(example.surfels, name).half().contiguous() for name in ScenePoints.__dataclass_fields__}
     with replacing(path) as part:
         save_file({**table, "labels": example.labels.short()}, part)
 
 
 def read_example(path: Path) -> Example:
-    """An example of a file, in single precision; InputError where it is damaged."""
+    """Read an example from a file, in single precision. Raises InputError for an invalid file."""
     must_exist(path, "an example (.safetensors) such as `ngff-lab clutter` writes")
     try:
         table = load_file(path)

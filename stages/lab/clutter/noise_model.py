@@ -1,7 +1,7 @@
-"""A model of what reconstruction from photos does to a scene, without the minutes that a reconstruction takes.
+"""Fast approximate model of the errors of a reconstruction from photos, which would take minutes.
 
-Depth of every view is bent at outlines, smoothed and pushed by noise that is smooth over the picture, and lost where
-there is no texture or only one view sees a place; the points of all views are then merged as `reconstruct` merges them.
+The depth of each view is distorted at outlines, smoothed, perturbed by spatially smooth noise, and removed where there
+is no texture or only one view sees the surface. The points of all views are then merged as `reconstruct` does.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from stages.core.perception.support import view_extent
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.scene import Scene
 
-WIDTH = 288  # of the longest side of the views [px]
+WIDTH = 288  # longest side of the simulated views [px]
 
 
 @dataclass(frozen=True)
 class Degradation:
-    """How bad a reconstruction is."""
+    """Strength of each kind of reconstruction error."""
 
-    bend: float  # shift of depth against colour [px]
-    fatten: float  # share of outlines at which the nearer surface spreads
+    bend: float  # shift of depth relative to colour [px]
+    fatten: float  # controls the fraction of the image in which nearer surfaces spread over their outlines
     drift: float  # relative depth noise, smooth over `patch` pixels
-    patch: float  # [px]
-    grain: float  # relative depth noise of single pixels
-    plain: float  # gradient below which depth is smoothed, and lost in `holes` of the picture
-    holes: float
-    merge: float  # side of the cells in which points are merged [camera distance]
+    patch: float  # correlation length of `drift` and `bend` [px]
+    grain: float  # relative depth noise, independent in each pixel
+    plain: float  # image gradient below which depth is smoothed, and in parts of the image lost
+    holes: float  # controls how much of these textureless areas is lost
+    merge: float  # side of the cells in which points are merged [camera distances]
 
     @classmethod
     def random(cls, rng: np.random.Generator) -> Degradation:
-        """From nearly perfect to poor."""
+        """Random parameters, from a nearly perfect to a poor reconstruction."""
         u = rng.uniform()
         return cls(
             bend=2.2 * u * rng.uniform(), fatten=0.5 * u * rng.uniform(), drift=0.009 * u * rng.uniform(),
@@ -50,12 +50,12 @@ class Degradation:
 
 
 class _Points(NamedTuple):
-    """Points of views before they are merged."""
+    """Points of the views before merging."""
 
     points: Float[Tensor, "p 3"]
     normals: Float[Tensor, "p 3"]
     rgb: Float[Tensor, "p 3"]
-    toward: Float[Tensor, "p 3"]  # unit vectors to the camera
+    toward: Float[Tensor, "p 3"]  # unit vectors towards the camera
     label: Int[Tensor, "p"]  # true object
 
     def select(self, rows: Tensor) -> _Points:
@@ -66,7 +66,7 @@ class _Points(NamedTuple):
 def observed(
     scene: Scene, rng: np.random.Generator, degradation: Degradation | None = None
 ) -> tuple[ScenePoints, Int[Tensor, "n"]]:
-    """Points as a reconstruction of the scene would have them, and the true object of the pixel each comes from."""
+    """Points as a reconstruction would produce them, and the true object in the source pixel of each."""
     d = degradation or Degradation.random(rng)
     g, view = scene.gaussians, view_extent(scene)
     parts, seen, fronts = [], torch.zeros(len(g)), []
@@ -93,7 +93,7 @@ def observed(
 
 
 def _view_points(rgb: np.ndarray, depth: np.ndarray, viewmat: Tensor, K: Tensor, d: Degradation, rng) -> tuple:
-    """Points (p, 3), normals, colours, directions to the camera and whether depth was found, of all pixels in rows."""
+    """Points (p, 3), normals, colours, directions to the camera and validity of depth, for all pixels in row order."""
     h, w = depth.shape
     far = float(np.quantile(depth[depth > 0], 0.99)) if (depth > 0).any() else 1.0
     z = np.where(depth > 0, depth, 2 * far)
@@ -123,7 +123,7 @@ def _view_points(rgb: np.ndarray, depth: np.ndarray, viewmat: Tensor, K: Tensor,
 
 
 def _bent(z: np.ndarray, d: Degradation, rng) -> np.ndarray:
-    """Depth moved against the picture by a smooth field of shifts."""
+    """Depth displaced in the image plane by a smooth random field of shifts."""
     h, w = z.shape
     rows, columns = np.mgrid[:h, :w]
     shift = [d.bend * _smooth(h, w, d.patch, rng) for _ in range(2)]
@@ -143,7 +143,7 @@ def _smooth(h: int, w: int, patch: float, rng) -> np.ndarray:
 
 
 def _merged(views: _Points, side: float, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
-    """One surfel for each occupied cell, with the most frequent label."""
+    """One surfel per occupied cell, with its most frequent label."""
     near = within_reach(views.points, torch.ones(len(views.points)), torch.zeros(len(views.points)))
     points, normals, rgb, toward, labels = views.select(near)
     _, owner, count = (points / side).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
@@ -154,7 +154,7 @@ def _merged(views: _Points, side: float, rng: np.random.Generator) -> tuple[Scen
     votes = torch.stack([owner, labels], 1).unique(dim=0, return_counts=True)
     order = votes[1].argsort(stable=True)
     own = torch.zeros(len(count), dtype=torch.int64)
-    own[votes[0][order, 0]] = votes[0][order, 1]  # the largest count is written last
+    own[votes[0][order, 0]] = votes[0][order, 1]  # the label with the most votes is written last
     middle, n = total(points) / count[:, None], len(count)
     lab = cielab_of(total(rgb) / count[:, None])
     surfels = ScenePoints(

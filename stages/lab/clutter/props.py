@@ -1,4 +1,4 @@
-"""Things that lie around on tables, as Gaussians: shapes from code with random colours, and textured meshes.
+"""Objects that lie around on tables, as Gaussians: procedural shapes with random colours, and textured meshes.
 
 Lengths are relative to the distance of the cameras, the unit of length of clutter scenes.
 """
@@ -42,21 +42,21 @@ from stages.lab.assets.signed_distance import (
 )
 
 Rng = np.random.Generator
-POINTS = 9000  # Gaussians of an object
-EXTENT = 0.62  # half side of the cube that holds every shape before normalisation
-SKIN = 0.004  # half width of the band sampled around a surface, less than half the thinnest sheet
+POINTS = 9000  # Gaussians per object
+EXTENT = 0.62  # half side of a cube that contains every shape before normalisation
+SKIN = 0.004  # half width of the band sampled around a surface, less than half the thickness of the thinnest sheet
 
 
 @dataclass(frozen=True)
 class Prop:
-    """An object at longest side 1, centred on the origin, and how it is used."""
+    """An object with longest side 1, centred on the origin, and how it is used."""
 
     name: str
-    gaussians: Gaussians  # object_id 1
-    sizes: tuple[float, float]  # smallest and largest longest side
-    flat: bool = False  # lies on its largest side, which is level here
-    clutter: bool = False  # too thin to be an object that a user would move
-    parts: Int[Tensor, "n"] | None = None  # convex part of each Gaussian; None: its convex hull stands for the object
+    gaussians: Gaussians  # with object_id 1
+    sizes: tuple[float, float]  # range of the longest side [camera distances]
+    flat: bool = False  # lies on its largest side, which is horizontal in this orientation
+    clutter: bool = False  # too thin to be an object that a user would move; labelled as background
+    parts: Int[Tensor, "n"] | None = None  # convex part of each Gaussian; None: collides as one convex hull
 
 
 def _book(rng: Rng) -> Field:
@@ -69,7 +69,7 @@ def _carton(rng: Rng) -> Field:
 
 
 def _sheet(rng: Rng) -> Field:
-    """A magazine, a phone, a keyboard, a mat: flat."""
+    """A flat object such as a magazine, a phone, a keyboard or a mat."""
     thick = math.exp(rng.uniform(math.log(0.012), math.log(0.05)))
     return slab((0, 0, 0), (0.5, thick, rng.uniform(0.15, 0.5)), rng.uniform(0.005, 0.1), 0.4 * thick)
 
@@ -116,7 +116,7 @@ def _cable(rng: Rng) -> Field:
     return tube(curve_through(knots.tolist(), 300), rng.uniform(0.012, 0.02))
 
 
-SHAPES: dict[str, tuple[Callable[[Rng], Field], tuple[float, float], float]] = {  # field, sizes, frequency
+SHAPES: dict[str, tuple[Callable[[Rng], Field], tuple[float, float], float]] = {  # field, sizes, relative frequency
     "book": (_book, (0.1, 0.32), 2.0), "carton": (_carton, (0.05, 0.32), 3.0), "sheet": (_sheet, (0.08, 0.35), 3.0),
     "bottle": (_bottle, (0.1, 0.35), 2.0), "can": (_can, (0.05, 0.22), 2.0), "cup": (_cup, (0.07, 0.25), 2.0),
     "plush": (_plush, (0.12, 0.45), 1.0), "pen": (_pen, (0.08, 0.15), 1.0), "cable": (_cable, (0.2, 0.5), 0.6),
@@ -124,12 +124,12 @@ SHAPES: dict[str, tuple[Callable[[Rng], Field], tuple[float, float], float]] = {
     "vessel": (FAMILIES["vessel"], (0.08, 0.3), 1.0), "ring": (FAMILIES["ring"], (0.06, 0.2), 0.4),
     "doll": (FAMILIES["doll"], (0.1, 0.4), 1.0), "box": (FAMILIES["box"], (0.05, 0.3), 1.0),
 }  # fmt: skip
-LEVEL = ("sheet", "book")  # lie on their largest side, that of the y axis
-CLUTTER = ("pen", "cable")
+LEVEL = ("sheet", "book")  # shapes that lie on their largest side, which is perpendicular to their y axis
+CLUTTER = ("pen", "cable")  # shapes labelled as background
 
 
 def make_prop(seed: int) -> Prop:
-    """A random shape with random colours; deterministic."""
+    """A random shape with random colours, determined by the seed."""
     rng = np.random.default_rng([seed, 7])
     names = list(SHAPES)
     weight = np.array([SHAPES[name][2] for name in names])
@@ -147,7 +147,7 @@ def make_prop(seed: int) -> Prop:
 
 
 def mesh_prop(files: Sequence[Path], name: str) -> Prop:
-    """A textured mesh; trays and other flat things lie on their largest side."""
+    """A textured mesh; trays and other flat objects lie on their largest side."""
     from stages.lab.assets.meshes import read_mesh
 
     g = read_mesh(files, POINTS, up="y")
@@ -163,7 +163,7 @@ def composite_prop(name: str, parts: list[PaintedPart], sizes: tuple[float, floa
 
 
 def random_colour(rng: Rng) -> Float[Tensor, "3"]:
-    """A colour: grey, black or white as often as a hue."""
+    """A random colour: a shade of grey in about a third of the cases, otherwise a hue of random saturation."""
     if rng.uniform() < 0.35:
         return torch.full((3,), float(rng.choice([0.04, 0.08, 0.3, 0.6, 0.85, 0.93]))) + 0.02 * torch.from_numpy(
             rng.normal(size=3)
@@ -173,7 +173,7 @@ def random_colour(rng: Rng) -> Float[Tensor, "3"]:
 
 
 def random_paint(rng: Rng) -> Callable[[Tensor], Tensor]:
-    """A surface colour: plain, or with up to four layers of spots, stripes, bands and print."""
+    """A random surface colour: uniform, or with up to four layers of spots, stripes, bands and print."""
     base = random_colour(rng)
     layers = [_layer(rng) for _ in range(int(rng.integers(0, 5)))]
 
@@ -187,7 +187,7 @@ def random_paint(rng: Rng) -> Callable[[Tensor], Tensor]:
 
 
 def _layer(rng: Rng) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    """A colour and the signed distance to where it is."""
+    """A colour, and the signed distance to the region that has it."""
     kind, seed, axis = rng.integers(4), int(rng.integers(1 << 30)), torch.from_numpy(rng.normal(size=3)).float()
     axis = torch.nn.functional.normalize(axis * torch.tensor([0.4, 0.4, 1.0]), dim=0)
     at, wide, size = float(rng.uniform(-0.35, 0.35)), float(rng.uniform(0.02, 0.2)), float(rng.uniform(0.03, 0.4))
@@ -204,13 +204,13 @@ def _layer(rng: Rng) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
 
 
 def recoloured(g: Gaussians, rng: Rng) -> Gaussians:
-    """The object in other colours: channels permuted, brightness and contrast changed."""
+    """The object in other colours: channels permuted and brightness scaled."""
     order = torch.from_numpy(rng.permutation(3))
     return replace(g, sh=g.sh[:, :, order] * float(rng.uniform(0.8, 1.15)))
 
 
 def random_turn(rng: Rng, flat: bool) -> Float[Tensor, "3 3"]:
-    """A rotation: about the vertical only for what stands or lies as it is, anything for one object in four."""
+    """A rotation about the vertical, or in one case of four, unless `flat`, any rotation."""
     angle = rng.uniform(0, 2 * math.pi)
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float32)
@@ -220,5 +220,5 @@ def random_turn(rng: Rng, flat: bool) -> Float[Tensor, "3 3"]:
 
 
 def placed(g: Gaussians, scale: float, R: Float[Tensor, "3 3"], at: Float[Tensor, "3"]) -> Gaussians:
-    """The object scaled, turned and moved."""
+    """The object scaled, rotated and moved."""
     return transformed(g, Similarity(scale, R, at))

@@ -1,4 +1,4 @@
-"""What `ngff reconstruct` makes of a simulated scene with known cameras, and the true labels of the result."""
+"""Reconstruction of a simulated scene by `ngff reconstruct` with known cameras, and true labels of the result."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from stages.reconstruct.photos import Photos
 from stages.reconstruct.sfm import SparseModel
 from stages.reconstruct.step_cache import StepCache
 
-MAX_DISTANCE = 0.025  # from the true surface; farther Gaussians are floaters [camera distance]
-FLOATER = -1  # label
-POINTS = (600, 2500)  # of the sparse model, as structure from motion finds in a dozen photos
-POINT_NOISE = 0.002  # of their positions [camera distance]
-HIDDEN = 0.02  # depth behind the visible surface at which a point is not seen [camera distance]
-ITERATIONS = 600  # of the fit: positions hardly change later
+MAX_DISTANCE = 0.025  # largest distance from the true surface; Gaussians beyond are floaters [camera distances]
+FLOATER = -1  # label of floaters
+POINTS = (600, 2500)  # number of points of the sparse model, as structure from motion finds in a dozen photos
+POINT_NOISE = 0.002  # standard deviation of their positions [camera distances]
+HIDDEN = 0.02  # depth difference to the visible surface from which a point is not seen [camera distances]
+ITERATIONS = 600  # of the photometric fit; positions hardly change later
 
 
 def reconstructed(
     scene: Scene, photos: Sequence[UInt8[Tensor, "h w 3"]], rng: np.random.Generator, device: str = "cpu"
 ) -> Scene:
-    """The scene reconstructed from its photos with the true cameras; InputError where there is too little in them."""
+    """The scene reconstructed from its photos with the true cameras. Raises InputError if they show too little."""
     names = scene.cameras.names
     given = Photos(tuple(photos), names, (0.0,) * len(names), Path("photos"))
     options = ReconstructOptions(cameras=Path("true cameras"), iterations=ITERATIONS, device=device)
@@ -43,7 +43,7 @@ def reconstructed(
 
 
 def _sparse_model(scene: Scene, rng: np.random.Generator, device: str) -> SparseModel:
-    """The true cameras, and random points of the surface that two or more of them see, with noise."""
+    """The true cameras, and random noisy points of the surface that are visible in two or more of them."""
     cameras, g = scene.cameras, scene.gaussians.to(device)
     count = int(rng.integers(*POINTS))
     points = scene.gaussians.means[torch.from_numpy(rng.permutation(len(g))[: 3 * count])]
@@ -63,11 +63,11 @@ def _sparse_model(scene: Scene, rng: np.random.Generator, device: str) -> Sparse
 
 
 def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
-    """Label of each Gaussian of `made`: what the true label images show in its pixels, by vote over the views.
+    """Label of each Gaussian of `made`: majority vote of the true label images in its pixels, over all views.
 
-    Where the reconstruction spreads an object over the table beside it, the nearest true Gaussian would say "object",
-    although photos show the table there. Gaussians in no view take the label of the nearest true Gaussian; those far
-    from every true surface are floaters. The cameras are matched by name.
+    The nearest true Gaussian would give a wrong label where the reconstruction spreads an object over the table beside
+    it, although photos show the table there. Gaussians in no view do take the label of the nearest true Gaussian, and
+    those far from all true surfaces are floaters. Cameras are matched by name.
     """
     rows = [truth.cameras.names.index(name) for name in made.cameras.names]
     to_made = umeyama(_frames(truth.cameras.viewmats[rows]), _frames(made.cameras.viewmats))
@@ -81,13 +81,13 @@ def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
 
 
 def label_image(scene: Scene, view: int) -> Int[Tensor, "h w"]:
-    """The object of the Gaussian with the largest weight in each pixel of a view; 0 where there is none."""
+    """The object of the Gaussian with the largest weight in each pixel of a view; 0 in empty pixels."""
     width, height = scene.cameras.sizes[view].tolist()
     front = visibility(scene.gaussians, scene.cameras.viewmats[view], scene.cameras.Ks[view], width, height).index
     return torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0)
 
 
 def _frames(viewmats: Tensor) -> Tensor:
-    """Camera centres and points one unit along their axes, which fix a rotation even for two cameras."""
+    """Camera centres and points along the camera axes, which determine a similarity even for two cameras."""
     eyes = centres(viewmats)
     return torch.cat([eyes, *(eyes + 0.3 * viewmats[:, i, :3] for i in range(3))])

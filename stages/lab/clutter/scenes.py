@@ -1,4 +1,4 @@
-"""Scenes of clutter: photos, their cameras, and the true Gaussians with labels."""
+"""Generation of clutter scenes: photos, their cameras, and the true Gaussians with labels."""
 
 from __future__ import annotations
 
@@ -42,26 +42,26 @@ from stages.lab.clutter.supports import Furniture, painted, random_furniture
 
 log = logging.getLogger(__name__)
 Rng = np.random.Generator
-PROPS = 160  # shapes from code that scenes are made of
+PROPS = 160  # number of different procedural shapes, and of composites
 TRUTH, PHOTOS, TRANSFORMS, OBSERVED = "truth.ply", "photos", "transforms.json", "observed_{}.safetensors"
-RECONSTRUCTED, EXACT = "reconstruction", "exact"  # in place of the number of an observation
-DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
-SHADOW_CELL = 0.01  # [camera distance]
-COMPOSITE_SHARE = 0.45  # of the things from code that have several parts
-ROW_SHARE = 0.35  # of scenes with a row of books on edge
-MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
-CLOSE_SHARE = 0.15  # of scenes of one to three things photographed from nearby
-CLOSE_SIZES = 0.5, 1.2  # their longest sides [camera distance]
+RECONSTRUCTED, EXACT = "reconstruction", "exact"  # take the place of the number in OBSERVED
+DATA_SET_POINTS = 15_000  # Gaussians kept of each of the data set's ten objects
+SHADOW_CELL = 0.01  # cell size of the shadow map [camera distances]
+COMPOSITE_SHARE = 0.45  # fraction of procedural objects that have several parts
+ROW_SHARE = 0.35  # fraction of scenes with a row of books on edge
+MESH_SHARE = 0.4  # fraction of the objects that are meshes, if there are any
+CLOSE_SHARE = 0.15  # fraction of scenes that are close-ups of one to three objects
+CLOSE_SIZES = 0.5, 1.2  # range of the longest side of objects in close-ups [camera distances]
 
 
 class Shelf:
-    """The props that scenes are made of, each made when it is first used."""
+    """The supply of props for scenes; each prop is made when first needed."""
 
     def __init__(self, meshes: Sequence[Path], seed: int):
         self.meshes, self.seed = find_objects(meshes) if meshes else [], seed
 
     def pick(self, rng: Rng) -> Prop:
-        """A random prop: a mesh, one of the ten objects, or a shape from code."""
+        """A random prop: a mesh, one of the data set's ten objects, or a procedural shape."""
         while self.meshes and rng.uniform() < MESH_SHARE:
             files = self.meshes[rng.integers(len(self.meshes))]
             try:
@@ -100,12 +100,12 @@ def _data_set_object(name: str) -> Prop:
 
 
 def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iterator[str]:
-    """Write OUT/NNNN/ for each scene; finished scenes are kept. Yields a line per scene.
+    """Write OUT/NNNN/ for each scene, skipping finished scenes. Yields a line per scene.
 
-    A folder has photos/, transforms.json and truth.ply, to be reconstructed; or with `options.observations` as many
-    files observed_K.safetensors, what the noise model makes of a reconstruction; or with `options.reconstruct`
-    observed_reconstruction.safetensors, of a real one; or with `options.exact` observed_exact.safetensors, of the true
-    Gaussians themselves.
+    Each folder has photos/, transforms.json and truth.ply, ready to be reconstructed. With `options.observations` it
+    instead has that many files observed_K.safetensors from the noise model, with `options.reconstruct`
+    observed_reconstruction.safetensors from a real reconstruction, and with `options.exact` observed_exact.safetensors
+    from the true Gaussians.
     """
     make_folder(Path(out))
     shelf = Shelf(meshes, options.seed)
@@ -128,12 +128,12 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
         if TRUTH in _outputs(options):
             _write_photos(scene, folder, rng)
             facts = provenance("clutter", inputs, options)
-            write_scene(folder / TRUTH, replace(scene, provenance=facts))  # last: it marks the scene as finished
+            write_scene(folder / TRUTH, replace(scene, provenance=facts))  # written last: marks the scene as finished
         yield f"{folder}: {things} things, {len(scene.cameras)} photos"
 
 
 def _outputs(options: ClutterOptions) -> list[str]:
-    """Names of the files of a finished scene."""
+    """Names of the files that a finished scene has."""
     names = [OBSERVED.format(k) for k in range(options.observations)]
     names += [OBSERVED.format(RECONSTRUCTED)] if options.reconstruct else []
     names += [OBSERVED.format(EXACT)] if options.exact else []
@@ -141,7 +141,7 @@ def _outputs(options: ClutterOptions) -> list[str]:
 
 
 def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene, int]:
-    """A scene with true labels, and how many things are in it."""
+    """A scene with true labels, and the number of its objects, including those labelled as background."""
     rng = np.random.default_rng([options.seed, index])
     furniture = random_furniture(rng)
     _, x1, _, y1, _ = furniture.areas[0]
@@ -150,7 +150,7 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
     wanted = int(round(math.exp(rng.uniform(math.log(2), math.log(40)))))
     props = [shelf.pick(rng) for _ in range(wanted)]
     size = [math.exp(rng.uniform(*np.log(prop.sizes))) for prop in props]
-    if rng.uniform() < 0.3:  # a few large things
+    if rng.uniform() < 0.3:  # larger objects
         size = [min(0.6, 1.6 * s) for s in size]
     row = _row_of_books(shelf, furniture, rng) if rng.uniform() < ROW_SHARE else []
     nearby = np.random.default_rng([options.seed, index, 5])
@@ -172,7 +172,7 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
 
 @dataclass(frozen=True)
 class _Start:
-    """A thing before it falls: its Gaussians about its origin, and where that is."""
+    """An object before it falls: its Gaussians about its origin, and the position of the origin."""
 
     prop: Prop
     gaussians: Gaussians
@@ -180,7 +180,7 @@ class _Start:
 
 
 def _row_of_books(shelf: Shelf, furniture: Furniture, rng: Rng) -> list[_Start]:
-    """Two to seven flat things on edge, side by side: some stay upright, some lean or fall over."""
+    """Up to seven flat objects on edge, side by side: some stay upright, others lean or fall over."""
     picked = [shelf.pick(rng) for _ in range(int(rng.integers(6, 30)))]
     books = [p for p in picked if p.flat and not p.clutter][:7]
     x0, x1, y0, y1, z = furniture.areas[rng.integers(len(furniture.areas))]
@@ -188,7 +188,7 @@ def _row_of_books(shelf: Shelf, furniture: Furniture, rng: Rng) -> list[_Start]:
     along, across = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
     at, out = np.array([rng.uniform(x0, x1), rng.uniform(y0, y1)]) * 0.7, []
     for prop in books:
-        columns = [across, (0, 0), along] if rng.uniform() < 0.5 else [(0, 0), -across, along]  # which side is up
+        columns = [across, (0, 0), along] if rng.uniform() < 0.5 else [(0, 0), -across, along]  # which side points up
         R = np.array([[*c, 0] for c in columns]).T
         R[2] = [0, 1, 0] if columns[0] is across else [1, 0, 0]
         g = placed(recoloured(prop.gaussians, rng), size * rng.uniform(0.8, 1.1), torch.from_numpy(R).float(),
@@ -205,10 +205,10 @@ def _row_of_books(shelf: Shelf, furniture: Furniture, rng: Rng) -> list[_Start]:
 def _arranged(
     furniture: Furniture, props: list[Prop], size: list[float], row: list[_Start], rng: Rng
 ) -> list[tuple[Prop, Gaussians]]:
-    """The things, and those of `row`, at rest on the furniture; those that fell off are left out."""
-    order = sorted(range(len(props)), key=lambda i: (not props[i].flat, -size[i]))  # sheets lie at the bottom
+    """The objects and `row` at rest on the furniture, without those that fell off."""
+    order = sorted(range(len(props)), key=lambda i: (not props[i].flat, -size[i]))  # flat objects lie at the bottom
     centre = rng.uniform(-0.3, 0.3, 2)
-    close = rng.uniform(0.3, 1.0)  # how far apart things lie
+    close = rng.uniform(0.3, 1.0)  # fraction of the area over which objects are spread
     falling, height = [*row], {}
     for i in order:
         area = furniture.areas[rng.integers(len(furniture.areas))] if rng.uniform() < 0.35 else furniture.areas[0]
@@ -244,7 +244,7 @@ def _arranged(
 
 
 def _hulls(prop: Prop, g: Gaussians) -> list[np.ndarray]:
-    """Corners of the convex parts of a placed prop; parts of a few Gaussians are left out."""
+    """Hull vertices of the convex parts of a placed prop; parts with few Gaussians are left out."""
     if prop.parts is None:
         return [hull_corners(g.means, 0.002)]
     count = torch.bincount(prop.parts)
@@ -252,7 +252,7 @@ def _hulls(prop: Prop, g: Gaussians) -> list[np.ndarray]:
 
 
 def _shaded(furniture: Gaussians, things: list[Gaussians], rng: Rng) -> Gaussians:
-    """The furniture darkened where things cast a soft shadow or touch it."""
+    """The furniture, darkened where objects cast soft shadows or touch it."""
     if not things:
         return furniture
     points = concatenate(things).means
@@ -273,7 +273,7 @@ def _shaded(furniture: Gaussians, things: list[Gaussians], rng: Rng) -> Gaussian
 
 
 def _density(points: Float[Tensor, "n 2"], at: Float[Tensor, "m 2"], blur: float) -> Float[Tensor, "m"]:
-    """How much points cover each place, 0 to 1, blurred by `blur` cells."""
+    """Fraction from 0 to 1 to which points cover each location, blurred by `blur` cells."""
     half = 150
     grid = np.zeros((2 * half, 2 * half))
     cell = (points / SHADOW_CELL + half).floor().long().clamp(0, 2 * half - 1).numpy()
@@ -284,7 +284,7 @@ def _density(points: Float[Tensor, "n 2"], at: Float[Tensor, "m 2"], blur: float
 
 
 def _cameras(furniture: Furniture, points: Float[Tensor, "n 3"], rng: Rng, options: ClutterOptions) -> Cameras:
-    """A full orbit, an arc of 60 to 140 degrees, or a hand-held path, looking at the things from distance 1 or so."""
+    """A full orbit, an arc of 60 to 140 degrees, or a hand-held path, looking at the objects from about distance 1."""
     start, stop = furniture.open_sides
     orbit = stop - start > 6 and rng.uniform() < 0.5
     if not orbit:
@@ -315,7 +315,7 @@ def _cameras(furniture: Furniture, points: Float[Tensor, "n 3"], rng: Rng, optio
 
 
 def _photos(scene: Scene, rng: Rng) -> Iterator[Float[Tensor, "h w 3"]]:
-    """Photos with noise, blur and changes of exposure."""
+    """Photos with noise, blur and varying exposure."""
     cameras, sky = scene.cameras, torch.from_numpy(rng.uniform(0.2, 0.9, 3)).float()
     blur, grain, sway = rng.uniform(0, 0.7), rng.uniform(0.0, 0.015), rng.uniform(0, 0.06)
     for i in range(len(cameras)):
@@ -326,7 +326,7 @@ def _photos(scene: Scene, rng: Rng) -> Iterator[Float[Tensor, "h w 3"]]:
 
 
 def _write_photos(scene: Scene, folder: Path, rng: Rng) -> None:
-    """The photos, and their cameras as a transforms.json."""
+    """Write the photos, and their cameras as a transforms.json."""
     cameras, frames = scene.cameras, []
     (folder / PHOTOS).mkdir(exist_ok=True)
     for i, (name, photo) in enumerate(zip(cameras.names, _photos(scene, rng), strict=True)):

@@ -1,4 +1,4 @@
-"""Rest poses of things dropped on furniture, as convex bodies, by MuJoCo."""
+"""Rest poses of objects dropped on furniture, simulated as rigid bodies of convex parts by MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from stages.lab.clutter.supports import Furniture
 
-TIMESTEP, DURATION = 0.004, 1.6  # [s]
-CORNERS = 60  # of a hull, at most
-DENSITY = 300.0
+TIMESTEP, DURATION = 0.004, 1.6  # of the simulation [s]
+CORNERS = 60  # maximum number of vertices of a hull
+DENSITY = 300.0  # of all objects
 
 
 def hull_corners(points: Tensor, margin: float) -> np.ndarray:
-    """At most CORNERS corners of the convex hull of points, made `margin` thick where it is flat."""
+    """At most CORNERS vertices of the convex hull of points, thickened by `margin` to both sides where it is flat."""
     p = points.double().numpy()
     directions = np.random.default_rng(0).normal(size=(CORNERS - 8, 3))
     extreme = p[(p @ directions.T).argmax(0)]
@@ -34,9 +34,9 @@ def hull_corners(points: Tensor, margin: float) -> np.ndarray:
 
 
 def settle(furniture: Furniture, hulls: list[list[np.ndarray]], starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Translations (n, 3) and quaternions (n, 4; w x y z) of bodies after they fell from `starts` (n, 3).
+    """Translations (n, 3) and quaternions (n, 4; w x y z) of bodies after falling from `starts` (n, 3).
 
-    `hulls` are the corners (m, 3) of the convex parts of each body, about its origin.
+    `hulls` holds the vertices (m, 3) of the convex parts of each body, relative to its origin.
     """
     import mujoco  # slow to import
 

@@ -1,4 +1,4 @@
-"""Furniture and rooms of clutter scenes, made of painted boxes: tables, seats, floors, walls, shelves; no objects."""
+"""Furniture and rooms of clutter scenes, made of painted boxes: tables, seats, floors, walls, shelves, mats."""
 
 from __future__ import annotations
 
@@ -18,55 +18,56 @@ from stages.lab.clutter.drapes import Drape
 from stages.lab.clutter.props import random_colour, random_paint
 
 Rng = np.random.Generator
-SPACING, COARSE = 0.008, 0.035  # of Gaussians on faces near the objects, and on the room [camera distance]
-MAT_SHARE = 0.5  # of scenes with mats
-SEAT_SHARE = 0.25  # of scenes on a chair, bench or sofa
-NEARBY_SHARE = 0.4  # of scenes with other furniture behind
-FRONT = 1.1 * math.pi, 1.9 * math.pi  # range of azimuths [rad]
+# spacing of Gaussians on faces near the objects, and on the room [camera distances]
+SPACING, COARSE = 0.008, 0.035
+MAT_SHARE = 0.5  # fraction of scenes with mats
+SEAT_SHARE = 0.25  # fraction of scenes on a chair, bench or sofa
+NEARBY_SHARE = 0.4  # fraction of scenes with other furniture in the background
+FRONT = 1.1 * math.pi, 1.9 * math.pi  # camera azimuths from which the front is visible [rad]
 PATTERNS = (paint.oak, paint.marble, paint.gingham, paint.flagstones, paint.worn_paint, paint.slate, paint.azulejo,
             paint.felt, paint.wooden_floor, paint.dark_floor, paint.bricks, paint.garden)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StaticBox:
-    """A box that stands still."""
+    """A static box."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
-    spacing: float = SPACING
-    yaw: float = 0.0  # about z [rad], after
-    tilt: float = 0.0  # about x [rad]
-    paint: int | None = None  # boxes of one number look alike; None: like no other
+    spacing: float = SPACING  # of the Gaussians on its faces
+    yaw: float = 0.0  # rotation about z [rad], applied after `tilt`
+    tilt: float = 0.0  # rotation about x [rad]
+    paint: int | None = None  # boxes with the same number have the same paint; None: a paint of its own
 
     def rotation(self) -> Float[Tensor, "3 3"]:
-        """From the box to the scene."""
+        """Rotation from box to scene coordinates."""
         (a, b), (c, s) = ((math.cos(x), math.sin(x)) for x in (self.yaw, self.tilt))
         return torch.tensor([[a, -b, 0], [b, a, 0], [0, 0, 1]]) @ torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
 
     def quaternion(self) -> tuple[float, float, float, float]:
-        """The same as a quaternion w x y z."""
+        """The same rotation as a quaternion w x y z."""
         (a, b), (c, s) = ((math.cos(x / 2), math.sin(x / 2)) for x in (self.yaw, self.tilt))
         return a * c, a * s, b * s, b * c
 
 
 @dataclass(frozen=True)
 class Furniture:
-    """The blocks of a scene, where things are dropped, and from where the cameras may look."""
+    """The static boxes of a scene, the areas where objects are dropped, and the possible camera directions."""
 
     blocks: list[StaticBox]
-    areas: list[tuple[float, float, float, float, float]]  # x0 x1 y0 y1 z of each surface that things stand on
-    open_sides: tuple[float, float]  # range of azimuths without walls [rad]
+    areas: list[tuple[float, float, float, float, float]]  # x0 x1 y0 y1 z of each surface for objects
+    open_sides: tuple[float, float]  # range of camera azimuths without walls [rad]
     drapes: tuple[Drape, ...] = ()  # on the first area
-    back: float = 1.0  # y behind it
+    back: float = 1.0  # y coordinate from which there is space behind the furniture
 
     def rise(self, low: tuple[float, float], high: tuple[float, float]) -> float:
-        """The highest that a drape is in a rectangle of the first area."""
+        """Maximum height of the drapes within a rectangle of the first area."""
         x, y = (torch.linspace(a, b, 9) for a, b in zip(low, high, strict=True))
         return max((float(d.height(torch.cartesian_prod(x, y)).max()) for d in self.drapes), default=0.0)
 
 
 def random_furniture(rng: Rng) -> Furniture:
-    """A table, a seat or a stretch of floor, its top at z = 0; in some scenes with walls, a partition or a shelf."""
+    """A table, seat or piece of floor with its top at z = 0; in some scenes with walls, a partition or a shelf."""
     made = _seat(rng) if rng.uniform() < SEAT_SHARE else _table(rng)
     if rng.uniform() < NEARBY_SHARE:
         made = replace(made, blocks=made.blocks + _nearby(made.back, rng), open_sides=_narrowed(made.open_sides))
@@ -76,7 +77,7 @@ def random_furniture(rng: Rng) -> Furniture:
 
 
 def _narrowed(sides: tuple[float, float]) -> tuple[float, float]:
-    """The front of what could be seen from all sides."""
+    """The azimuths restricted to the front, if the scene was open on all sides."""
     return FRONT if sides[0] == 0 else sides
 
 
@@ -96,7 +97,7 @@ def _table(rng: Rng) -> Furniture:
     areas = [(-used[0], used[0], -used[1], used[1], 0.0)]
     sides, back = (0.0, 2 * math.pi), used[1] + rng.uniform(0.06, 0.2) if on_floor else b
     low = 0.0 if on_floor else -0.6
-    if rng.uniform() < 0.35:  # a wall behind, in half of the scenes one at the side too
+    if rng.uniform() < 0.35:  # a wall behind, and in 40 % of these scenes another one at the side
         gap = rng.uniform(0.0, 0.06)
         blocks.append(StaticBox((0, back + gap + 0.03, low + 1.0), (3.5, 0.03, 1.2), COARSE / 1.5))
         sides = FRONT
@@ -119,14 +120,14 @@ def _table(rng: Rng) -> Furniture:
 
 
 def _seat(rng: Rng) -> Furniture:
-    """A chair, bench or sofa with a back that may be curved, tilted or of slats, and in some scenes with arms."""
+    """A chair, bench or sofa, whose back may be curved, tilted or slatted, in some scenes with armrests."""
     a, b = math.exp(rng.uniform(math.log(0.22), math.log(0.8))), rng.uniform(0.2, 0.4)
     thick, height = rng.uniform(0.01, 0.08), rng.uniform(0.3, 0.6)
     alike = 0 if rng.uniform() < 0.7 else None
     blocks = [StaticBox((0, 0, -thick), (a, b, thick), paint=0), _floor(height)]
     if rng.uniform() < 0.5:
         blocks += _legs(0.9 * a, 0.85 * b, 2 * thick, height)
-    else:  # down to the floor
+    else:  # a solid base down to the floor
         half = (height - 2 * thick) / 2
         blocks.append(StaticBox((0, 0, half - height), (0.95 * a, 0.95 * b, half), 2 * SPACING, paint=alike))
     if rng.uniform() < 0.85:
@@ -138,11 +139,12 @@ def _seat(rng: Rng) -> Furniture:
 
 
 def _back(a: float, b: float, paint: int | None, rng: Rng) -> list[StaticBox]:
-    """The back of a seat of half sides a and b: strips along an arc, tilted backwards."""
+    """The back of a seat with half sides a and b: strips along an arc, tilted backwards."""
     strips = int(rng.integers(5, 12)) if rng.uniform() < 0.6 else 1
-    bend = min(rng.uniform(0.1, 0.7), 2 * math.atan(0.25 * b / a)) if strips > 1 else 0.0  # a quarter of b deep
+    # the depth of the arc is at most a quarter of b
+    bend = min(rng.uniform(0.1, 0.7), 2 * math.atan(0.25 * b / a)) if strips > 1 else 0.0
     rise, deep, tilt = rng.uniform(0.12, 0.35), rng.uniform(0.008, 0.06), rng.uniform(0, 0.35)
-    gap = rng.uniform(0, 0.12) if rng.uniform() < 0.3 else -0.02  # between it and the seat
+    gap = rng.uniform(0, 0.12) if rng.uniform() < 0.3 else -0.02  # between back and seat
     if slats := strips > 1 and rng.uniform() < 0.3:
         bend *= 0.5
     radius = a / math.sin(bend) if bend else 0.0
@@ -151,7 +153,7 @@ def _back(a: float, b: float, paint: int | None, rng: Rng) -> list[StaticBox]:
     for k in range(strips):
         angle = bend * (2 * (k + 0.5) / strips - 1) if strips > 1 else 0.0
         x, y = radius * math.sin(angle), b + deep - radius * (1 - math.cos(angle))
-        up = math.sin(tilt) * rise  # the middle is this far behind the lower edge
+        up = math.sin(tilt) * rise  # distance of the centre behind the lower edge
         centre = (x - up * math.sin(-angle), y + up * math.cos(angle), gap + math.cos(tilt) * rise)
         out.append(StaticBox(centre, (wide, deep, rise), yaw=angle, tilt=-tilt, paint=paint))
     return out
@@ -168,7 +170,7 @@ def _floor(height: float) -> StaticBox:
 
 
 def _nearby(back: float, rng: Rng) -> list[StaticBox]:
-    """Cabinets, boards and boxes that stand on the floor behind."""
+    """Cabinets, boards and boxes on the floor in the background."""
     out = []
     for _ in range(int(rng.integers(1, 4))):
         half = (rng.uniform(0.1, 0.5), rng.uniform(0.02, 0.3), rng.uniform(0.3, 0.7))
@@ -179,7 +181,7 @@ def _nearby(back: float, rng: Rng) -> list[StaticBox]:
 
 
 def _mat(used: tuple[float, float], rng: Rng) -> StaticBox:
-    """A mat, cloth or sheet of paper that lies on the surface: too thin to be an object."""
+    """A mat, cloth or sheet of paper on the surface, too thin to be an object."""
     half = (rng.uniform(0.06, 0.4), rng.uniform(0.06, 0.3), math.exp(rng.uniform(math.log(0.0005), math.log(0.003))))
     x, y = rng.uniform(-used[0], used[0]), rng.uniform(-used[1], used[1])
     half = (min(half[0], abs(used[0] - abs(x)) + 0.05), min(half[1], abs(used[1] - abs(y)) + 0.05), half[2])
@@ -187,7 +189,7 @@ def _mat(used: tuple[float, float], rng: Rng) -> StaticBox:
 
 
 def painted(furniture: Furniture, rng: Rng) -> Gaussians:
-    """The Gaussians of all faces, object_id 0."""
+    """The Gaussians on all faces and drapes, with object_id 0."""
     parts = []
     faces: dict[int, Callable[[Tensor], Tensor]] = {}
     for block in furniture.blocks:
@@ -207,7 +209,7 @@ def painted(furniture: Furniture, rng: Rng) -> Gaussians:
 
 
 def random_face(rng: Rng) -> Callable[[Tensor], Tensor]:
-    """A colour of points on a box: a pattern of one of the tables of the data set, noise of two colours, or plain."""
+    """A random colour function for points on a box: a pattern of a data set table, or noise between two colours."""
     kind, scale, seed = rng.uniform(), float(rng.uniform(1.0, 4.0)), int(rng.integers(1 << 30))
     one, two = random_colour(rng), random_colour(rng)
     if kind < 0.45:
@@ -224,7 +226,7 @@ def random_face(rng: Rng) -> Callable[[Tensor], Tensor]:
 
 
 def _unrolled(p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
-    """Plane coordinates of points on the faces of a box."""
+    """Planar texture coordinates of points on the faces of a box."""
     return torch.stack([p[:, 0] + 0.7 * p[:, 2], p[:, 1] + 0.7 * p[:, 2]], 1)
 
 

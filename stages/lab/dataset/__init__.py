@@ -1,1 +1,1 @@
-"""The GSCollision data set: making, checking, importing."""
+"""Generation, verification and import of the GSCollision data set."""

@@ -33,7 +33,7 @@ from stages.render.draw import render_view
 from stages.render.overlay import draw_caption, tile_images
 
 SHEET_COLUMNS, IMAGE_SIZE = 6, 200  # images per row and their width and height [px]
-VIEW_STEP = 12  # orbit views between one row and the next, so that the rows show different sides
+VIEW_STEP = 12  # orbit views from one row to the next, so that the rows show different sides
 JPEG_QUALITY = 88
 
 
@@ -51,9 +51,9 @@ class SheetOptions:
 
 
 def write_sheet(data: Path, out: Path, options: SheetOptions) -> None:
-    """Write a JPEG with one row of SHEET_COLUMNS frames, first to last, for each chosen scene.
+    """Write a JPEG with one row of SHEET_COLUMNS frames, from first to last, for each chosen scene.
 
-    Raises InputError when the data set has none of the groups.
+    Raises InputError if the data set has none of the groups.
     """
     layout, device = Layout(Path(data)), pick_device(options.device)
     groups = [g for g in options.groups if layout.motions(g).is_file()]
@@ -101,7 +101,7 @@ def _render_row(
 
 
 def _object_gaussians(layout: Layout, name: str) -> Gaussians:
-    """An object at its scale prior: the data set's own file, or made if that is missing."""
+    """An object at its scale prior, from the file of the data set, or generated if the file is missing."""
     path = layout.object(name)
     return at_scale_prior(read_scene(path).gaussians if path.exists() else make_object(name), OBJECTS[name].scale)
 

@@ -14,14 +14,14 @@ from stages.lab.dataset.layout import Layout
 from stages.lab.dataset.options import DatasetOptions
 from stages.lab.dataset.selection import ORBIT_VIEWS, SCENE_COUNTS, object_count
 
-VIDEO_FIXED_CAMERA, VIDEO_MOVING_CAMERA, DEPTH_MAP = 0.02, 0.035, 1.2  # measured size [bytes/px]
-KEYPOINT_COMPRESSION = 0.55  # compressed size of keypoints divided by the raw size, measured
-MAX_DISK_FRACTION = 0.98  # of the free space that may be filled
+VIDEO_FIXED_CAMERA, VIDEO_MOVING_CAMERA, DEPTH_MAP = 0.02, 0.035, 1.2  # measured compressed sizes [bytes/px]
+KEYPOINT_COMPRESSION = 0.55  # ratio of compressed to raw size of keypoints, measured
+MAX_DISK_FRACTION = 0.98  # fraction of the free space that may be filled
 
 
 @dataclass(frozen=True)
 class SizeEstimate:
-    """Sizes in bytes: exact for uncompressed data, from measured ratios for compressed data."""
+    """Sizes in bytes: exact for uncompressed data, estimated from measured ratios for compressed data."""
 
     frames: int
     keypoints: int
@@ -53,11 +53,11 @@ class SizeEstimate:
 
 
 def missing_bytes(layout: Layout, options: DatasetOptions) -> dict[str, float]:
-    """Bytes still to be written of each part; objects that scenes need have been made before."""
+    """Bytes still to be written for each part. The objects must already have been made."""
     sizes = SizeEstimate(options.frames, options.keypoints, options.resolution)
     paths = [layout.object(name) for name in OBJECTS]
     counts = [PlyData.read(str(p), mmap="r")["vertex"].count for p in paths if p.exists()]
-    mean_count = sum(counts) / max(len(counts), 1)  # Gaussians of an object
+    mean_count = sum(counts) / max(len(counts), 1)  # mean number of Gaussians of an object
     views, backgrounds = len(options.view_indices), len(options.background_names)
     out = {}
     for part in ("scene_configs", "motions", "scenes", "mpm", "initial", "dynamic"):
@@ -75,7 +75,7 @@ def missing_bytes(layout: Layout, options: DatasetOptions) -> dict[str, float]:
                 "dynamic": scenes * backgrounds * views * sizes.video(),
             }[part]
             file = {"scene_configs": layout.config(group), "motions": layout.motions(group)}.get(part)
-            # a file that exists is complete
+            # files are written atomically, so an existing file is complete
             written = total * file.exists() if file else _folder_size(layout.root / part / group)
             out[part] += max(total - written, 0.0)
     return out
@@ -86,7 +86,7 @@ def _folder_size(folder: Path) -> int:
 
 
 def require_disk_space(root: Path, parts: dict[str, float]) -> None:
-    """Print the size of each missing part [bytes]; raise InputError when the free space is too small."""
+    """Print the size of each missing part [bytes]; raise InputError if the free space is too small."""
     total, free = sum(parts.values()), shutil.disk_usage(root).free
     if not total:
         return

@@ -1,4 +1,4 @@
-"""Objects other than the ten as MPM particles: shapes, meshes, and rotations of the ten."""
+"""MPM particles of objects other than the data set's ten: procedural shapes, meshes, and rotated copies of the ten."""
 
 from __future__ import annotations
 
@@ -27,19 +27,21 @@ from stages.lab.dataset.object_particles import Asset, cached_points, count_for_
 from stages.lab.dataset.options import Discretisation
 
 log = logging.getLogger(__name__)
-FIRST_MESH_ID, FIRST_ROTATED_ID, FIRST_RANDOM_MESH_ID = 100, 2000, 3000  # object ids
-PARTICLES_PER_CELL_AXIS = 1.5  # of solid bodies
-SURFACE_POINTS = 30_000  # of a shape, from which particles are sampled
+FIRST_MESH_ID, FIRST_ROTATED_ID, FIRST_RANDOM_MESH_ID = 100, 2000, 3000  # first object id of each kind
+PARTICLES_PER_CELL_AXIS = 1.5  # particles of solid bodies per grid cell and axis
+SURFACE_POINTS = 30_000  # surface points of a shape, from which particles are sampled
 MESH_SIZE_RANGE = (0.25, 0.8)  # longest side of a random mesh [m]
-MESH_DENSITY_RANGE = (100.0, 2700.0)  # of its material [kg/m^3]
-MESH_STIFFNESS_RANGE = (100.0, 1e5)  # E over density [m^2/s^2]: from a cushion to light wood
-MAX_YOUNG = 2e7  # of a mesh, as of the stiffest of the ten (phone): hardly deforms, and substeps stay affordable [Pa]
+MESH_DENSITY_RANGE = (100.0, 2700.0)  # density of a random mesh [kg/m^3]
+MESH_STIFFNESS_RANGE = (100.0, 1e5)  # E / density of a random mesh [m^2/s^2], from a cushion to light wood
+# Largest Young's modulus of a mesh [Pa], that of the stiffest of the ten objects (phone): such bodies hardly deform,
+# and substeps are still affordable.
+MAX_YOUNG = 2e7
 
 
 def rotated_assets(
     assets: Mapping[int, Asset], count: int, discretisation: Discretisation, seed: int = 0
 ) -> dict[int, Asset]:
-    """`count` randomly rotated copies of the objects in turn, with new ids."""
+    """`count` copies of the objects, taken in turn and rotated randomly, with new ids."""
     made = {}
     for i in range(count):
         asset = list(assets.values())[i % len(assets)]
@@ -50,7 +52,7 @@ def rotated_assets(
 
 
 def _rotated(points: Float[Tensor, "p 3"], rng: np.random.Generator) -> Float[Tensor, "p 3"]:
-    """Randomly rotated, centred on the bounding box."""
+    """The points rotated randomly and centred on their bounding box."""
     points = points @ matrix(torch.from_numpy(rng.normal(size=4)).float()).T
     return points - (points.amin(0) + points.amax(0)) / 2
 
@@ -59,9 +61,9 @@ def load_shape_assets(
     shapes: Mapping[str, ShapeKind], discretisation: Discretisation, min_particles: int, cache: Path | None = None,
     solid: bool = False,
 ) -> dict[int, Asset]:  # fmt: skip
-    """Objects of signed distance fields by id; `cache` is a file (.npz) of their particles, read or written.
+    """Objects defined by signed distance fields, by id; `cache` is a file (.npz) for their particles, read or written.
 
-    Each has at least `min_particles` surface particles, and with `solid` interior ones after them.
+    Each object has at least `min_particles` surface particles, with `solid` followed by interior particles.
     """
     key = f"spacing {discretisation.spacing} least {min_particles}" + f" dx {discretisation.dx}" * solid
 
@@ -80,9 +82,9 @@ def load_shape_assets(
 def mesh_assets(
     meshes: Sequence[Sequence[Path]], size: float, discretisation: Discretisation, min_particles: int
 ) -> dict[int, Asset]:
-    """Meshes, each of one or several files, as objects 100, 101, ...; file and folder names choose the materials.
+    """Objects 100, 101, ... from meshes of one or several files each; materials are guessed from file and folder names.
 
-    `size` is the longest side of each [m].
+    `size` is the longest side of each object [m].
     """
     from stages.lab.assets.meshes import read_mesh  # needs an optional extra
 
@@ -105,9 +107,9 @@ def random_mesh_assets(
     seed: int = 0,
     cache: Path | None = None,
 ) -> dict[int, Asset]:
-    """`count` objects of random sizes and materials from meshes in a random order; every other one is turned at random.
+    """`count` objects of random size and material from randomly chosen meshes; every second one is rotated randomly.
 
-    `cache` is a file (.npz) of their particles, read or written.
+    `cache` is a file (.npz) for their particles, read or written.
     """
     from stages.lab.assets.meshes import read_mesh  # needs an optional extra
 
@@ -137,7 +139,7 @@ def random_mesh_assets(
 def _shape_particles(
     kind: ShapeKind, discretisation: Discretisation, min_particles: int, solid: bool
 ) -> Float[Tensor, "p 3"]:
-    """Particles of the surface, and with `solid` those of the interior after them."""
+    """Particles of the surface, with `solid` followed by particles of the interior."""
     if not solid:
         return _sample_points(kind.scale * surface_points(kind, SURFACE_POINTS), discretisation, min_particles)
     spacing = discretisation.dx / PARTICLES_PER_CELL_AXIS / kind.scale
@@ -148,7 +150,7 @@ def _shape_particles(
 def _sample_points(
     points: Float[Tensor, "n 3"], discretisation: Discretisation, min_particles: int
 ) -> Float[Tensor, "p 3"]:
-    """Some of the points, by farthest-point sampling."""
+    """A subset of the points, chosen by farthest-point sampling."""
     if len(points) < min_particles:
         raise InputError(f"--keypoints {min_particles}: an object has only {len(points)} surface points")
     count = min(len(points), max(min_particles, count_for_spacing(points, discretisation.spacing)))
@@ -159,5 +161,5 @@ def _sample_points(
 def _asset(
     id: int, scale: float, points: Tensor, material: tuple[float, float], discretisation: Discretisation
 ) -> Asset:
-    """An object of particles; `material` is Young's modulus [Pa] and density [kg/m^3]."""
+    """An object made of particles; `material` is Young's modulus [Pa] and density [kg/m^3]."""
     return Asset(id, scale, points, particle_volumes(points, discretisation.dx), *material)

@@ -1,10 +1,10 @@
-"""Every Gaussian of a scene in every frame, skinned to the simulated particles and stored in the published format.
+"""All Gaussians of a scene in every frame, skinned to the simulated particles and stored in the published format.
 
     mpm/<group>/<scene>/0000.h5 ...   pos (n,3); cov3D (n,6): xx xy xz yy yz zz; rot (n,3,3): the transposed rotation
     shs.h5 "shs" (n,9,3)  opacity.h5 "opacity" (n,1)                                        all of them float16
 
 Rows are the Gaussians of the scene with opacity above 0.02, in the order of the objects. The published solver has one
-particle per Gaussian; here there may be fewer particles, and a Gaussian follows the eight particles nearest to it in
+particle per Gaussian. Here there may be fewer particles, and each Gaussian follows the eight particles nearest to it in
 the rest pose. Source of the format: public code of NGFF.
 """
 
@@ -33,16 +33,16 @@ from stages.lab.dataset.layout import Layout, object_kind
 from stages.lab.dataset.object_particles import Asset, at_scale_prior
 from stages.lab.dataset.scene_configs import SceneConfig
 
-SH_COEFFICIENTS = 9  # stored per channel (degree 2)
+SH_COEFFICIENTS = 9  # spherical harmonics stored per channel (degree 2)
 
 
 @dataclass(frozen=True)
 class ObjectSkin:
-    """Gaussians of one object about the origin, and the binding of the opaque ones to its particles."""
+    """Gaussians of one object about the origin, and the binding of the opaque Gaussians to its particles."""
 
-    gaussians: Gaussians  # all of them
-    opaque: Gaussians  # n of them, those with opacity above MIN_PARTICLE_OPACITY
-    index: Tensor  # (n, 8) int32, rows of the object's particles
+    gaussians: Gaussians  # all Gaussians of the object
+    opaque: Gaussians  # the n Gaussians with opacity above MIN_PARTICLE_OPACITY
+    index: Tensor  # (n, 8) int32, rows of the object's particles that each opaque Gaussian follows
     weight: Float[Tensor, "n 8"]
 
 
@@ -91,9 +91,9 @@ class SkinnedScene:
         self._particles = torch.cat(bodies).to(device)
 
     def at(self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]) -> tuple[Gaussians, Float[Tensor, "n 3 3"]]:
-        """The deformed Gaussians and the rotation of each, for particle positions [m] and deformation gradients.
+        """The deformed Gaussians and their rotations, for particle positions [m] and deformation gradients.
 
-        All are on the device of the scene. Spherical harmonics are not rotated (as published).
+        All tensors are on the device of the scene. Spherical harmonics are not rotated (as published).
         """
         motion = KeypointMotion(self._particles, x - self._particles, F - torch.eye(3, device=x.device))
         means, quats, scales, R = skin_gaussians(self._binding, motion, self.rest)
@@ -113,7 +113,7 @@ def write_frames(folder: Path, scene: SkinnedScene, x: Sequence[Tensor], F: Sequ
 
 
 def _write(path: Path, **tensors: Tensor) -> None:
-    """Write datasets through memory: HDF5 crashes when the disk fills up while it writes."""
+    """Write datasets through memory, because HDF5 crashes if the disk fills up during a write."""
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         for name, tensor in tensors.items():

@@ -1,7 +1,7 @@
 """Generation of GSCollision: scenes of falling objects, simulated in batches, in the published layout (layout.py).
 
-Files and folders appear complete or not at all, so a run can be killed at any time and started again; existing files
-are kept. Fewer particles than the published Gaussians are simulated: see stages/lab/dataset/README.md.
+Files and folders are written atomically and existing files are kept, so a run can be killed at any time and started
+again. Fewer particles than the published Gaussians are simulated: see stages/lab/dataset/README.md.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def run(out: Path, options: DatasetOptions) -> None:
-    """Write all missing files of the data set; raises InputError when the disk is too small or settings differ."""
+    """Write all missing files of the data set. Raises InputError if the disk is too small or settings differ."""
     generator = DatasetGenerator(Path(out), options)
     generator.make_shared()
     require_disk_space(generator.layout.root, missing_bytes(generator.layout, options))
@@ -52,7 +52,7 @@ def run(out: Path, options: DatasetOptions) -> None:
 
 
 def check(out: Path) -> None:
-    """Verify the sha256 of all files of a data set; raises InputError when one is missing, changed or not listed."""
+    """Verify the sha256 of all files of a data set. Raises InputError if one is missing, changed or not listed."""
     print(f"{out}: {manifest.verify_files(Path(out))} files, all unchanged")
 
 
@@ -68,12 +68,12 @@ class DatasetGenerator:
 
     @cached_property
     def assets(self) -> dict[int, Asset]:
-        """The objects of the data set as particles, by id; made or read on first use."""
+        """The objects of the data set as particles, by id; sampled or read on first use."""
         return load_assets(self.options, self.options.keypoints, self.layout.root / "particles.npz")
 
     @cached_property
     def scene_assets(self) -> SceneAssets:
-        """Particles, skins and backgrounds of the scene files."""
+        """Particles, skins and backgrounds needed to write the scene files."""
         from stages.lab.dataset.scene_files import SceneAssets
 
         names = self.options.background_names if "backgrounds" in self.options.needed_parts else ()
@@ -99,7 +99,7 @@ class DatasetGenerator:
         layout, parts = self.layout, {*self.options.needed_parts}
         paths = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in SCENE_PARTS)]
         _remove_partial(paths)
-        self._write_checksums(group, paths)  # bring the list up to date after a killed run or removed files
+        self._write_checksums(group, paths)  # update the list, in case a run was killed or files were removed
         if "scene_configs" in parts and not layout.config(group).exists():
             self._write_configs(group)
         if "motions" in parts:

@@ -4,9 +4,9 @@
     OUT/motions/heldout.h5             keypoint trajectories, as `ngff-lab dataset` writes
     OUT/particles_heldout.npz          the objects as particles, cached for the next run
 
-The groups for training are `varied`: random hollow shapes (the ten are hollow too); `solid`: filled random shapes,
-like the bodies simulated from photos; `turned`: the ten, each randomly rotated, which they never are in the data set;
-and `meshes`: meshes of random size and material. With another seed than 0 it ends a group's name (`varied_1`).
+The groups for training are `varied`: random hollow shapes (the ten are hollow too); `solid`: filled random shapes, like
+the bodies simulated from photos; `turned`: randomly rotated copies of the ten, which the data set never rotates; and
+`meshes`: meshes of random size and material. A seed other than 0 is appended to the name of a group (`varied_1`).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from stages.lab.dataset.scene_configs import SceneConfig, sample_scene, write_sc
 from stages.lab.dataset.selection import HELDOUT, MESHES, ROTATED, SOLID, VARIED
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
-# index, and seed, of the first scene
+# index of the first scene of each group, which is also its random seed
 FIRST_SCENE = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, ROTATED: 40_000, MESHES: 50_000}
-SCENES_PER_SEED = 100_000
-SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of random shapes
+SCENES_PER_SEED = 100_000  # offset of the scene index from one --seed to the next
+SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # base seed of the random shapes of each group
 
 
 def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) -> str:
     """Write one group of scenes and return a one-line summary; an existing group is kept.
 
-    `meshes` are files and folders. Raises InputError when they are combined with --solid or --rotations, or a mesh
+    `meshes` are files and folders. Raises InputError if they are combined with --solid or --rotations, or if a mesh
     cannot be read.
     """
     group = options.group(bool(meshes))
@@ -74,7 +74,7 @@ def run(out: Path, options: HeldoutOptions, meshes: list[Path] | None = None) ->
 
 
 def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Path) -> dict[int, Asset]:
-    """The objects that the options choose."""
+    """The objects selected by the options."""
     how, seed = (options, options.keypoints), options.seed
     if meshes and options.shapes:
         return extra_objects.random_mesh_assets(meshes, options.shapes, *how, seed, cache)
@@ -92,7 +92,7 @@ def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Pa
 def sample_configs(
     assets: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST_SCENE[HELDOUT]
 ) -> dict[str, SceneConfig]:
-    """Scene configurations sampled as for the data set, with the seeds from `first` on."""
+    """Scene configurations sampled as for the data set, with seeds starting at `first`."""
     extents = placement_extents(assets)
     configs = (sample_scene(first + i, objects, extents) for i in tqdm(range(scenes), desc="placing", unit="scene"))
     return {c.name: c for c in configs}

@@ -2,7 +2,7 @@
 
 Row i of a frame is the i-th Gaussian of the scene with opacity above 0.02 inside the simulated cube [-1, 1]^3. Some
 rows become keypoints, to which all Gaussians are skinned. The object of each Gaussian is a property `object_id` of the
-scene file (written by ngff), or follows from the order of objects in scene_configs/<group>.json and their
+scene file (if written by ngff), or follows from the order of objects in scene_configs/<group>.json and their
 Gaussian counts.
 """
 
@@ -36,9 +36,9 @@ from stages.lab.dataset.options import FRAME_INTERVAL
 from stages.lab.dataset.scene_configs import read_scene_configs
 
 FILE_KIND = "a frame of GSCollision (.h5 with pos, cov3D and rot)"
-HALF_EXTENT = 1.0  # of the simulated cube [m]
-POSITION_TOLERANCE = 2e-3  # between float16 positions and those of the scene [m]
-RESOLUTION = 448  # of the published views [px]
+HALF_EXTENT = 1.0  # half side of the simulated cube [m]
+POSITION_TOLERANCE = 2e-3  # largest difference between float16 positions and those of the scene [m]
+RESOLUTION = 448  # side of the published views [px]
 # Gaussian count of the published objects. Source: public code of NGFF
 PUBLISHED_COUNTS = {"ball": 106115, "bowl": 232764, "can": 70569, "cloth": 116188, "duck": 80544, "miku": 48316,
              "panda": 56104, "phone": 26571, "pillow": 64229, "rope": 8051}  # fmt: skip
@@ -47,7 +47,7 @@ PUBLISHED_COUNTS = {"ball": 106115, "bowl": 232764, "can": 70569, "cloth": 11618
 def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -> str:
     """Write `out` with at most `count` keypoints per object and return a one-line summary.
 
-    Raises InputError when the frames are incomplete or do not belong to the scene.
+    Raises InputError if the frames are incomplete or do not belong to the scene.
     """
     folder = Path(folder)
     frames = frame_files(folder)
@@ -66,14 +66,14 @@ def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -
     with TrajectoryWriter(out, initial, info, keypoints, bind_gaussians(initial, keypoints)) as trajectory:
         for t, positions in enumerate(_read_positions(frames, len(rows))):
             com = torch.stack([positions[owner == i].mean(0) for i in ids])
-            points = positions[chosen] if t else keypoints.rest  # more precise than float16
+            points = positions[chosen] if t else keypoints.rest  # the rest positions are not rounded to float16
             trajectory.append(points, com, object_rotations(keypoints, points, ids))
     names = ", ".join(o.name for o in initial.objects)
     return f"{out}: {len(frames)} frames of {names}, {len(rows)} Gaussians, {len(keypoints.rest)} keypoints"
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """The frames 0000.h5, 0001.h5, ... of a folder; raises InputError when there are none or one is missing."""
+    """The frames 0000.h5, 0001.h5, ... of a folder. Raises InputError if there are none or one is missing."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give mpm/<group>/<scene> of the data set")
     frames = sorted(p for p in folder.glob("*.h5") if p.stem.isdigit())
@@ -88,15 +88,15 @@ def frame_files(folder: Path) -> list[Path]:
 
 
 def _locate(folder: Path) -> tuple[Layout, str, str]:
-    """Data set, group and scene name of ROOT/mpm/<group>/<scene>."""
+    """Data set root, group and scene name from the path ROOT/mpm/<group>/<scene>."""
     folder = folder.resolve()
     return Layout(folder.parents[min(2, len(folder.parents) - 1)]), folder.parent.name, folder.name
 
 
 def label_objects(scene: Scene, source: Path, layout: Layout, group: str, name: str) -> Scene:
-    """The scene with object ids: its own, or those that follow from the object order in its configuration.
+    """The scene with object ids: its own, or derived from the object order in its configuration.
 
-    `source` is the file of the scene, for messages. Raises InputError when the configuration is missing or does not
+    `source` is the file of the scene, for messages. Raises InputError if the configuration is missing or does not
     match the number of Gaussians.
     """
     if scene.objects:
@@ -120,7 +120,7 @@ def label_objects(scene: Scene, source: Path, layout: Layout, group: str, name: 
 
 
 def _gaussian_count(layout: Layout, name: str) -> int:
-    """Number of Gaussians of an object: of the data set's own file, or the published number."""
+    """Number of Gaussians of an object, from the file of the data set, or as published."""
     path = layout.object(name)
     if not path.exists():
         return PUBLISHED_COUNTS[name]
@@ -131,7 +131,7 @@ def _gaussian_count(layout: Layout, name: str) -> int:
 
 
 def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
-    """Index of the Gaussian of each row; raises InputError when the frames do not belong to the scene."""
+    """Index of the Gaussian of each row. Raises InputError if the frames do not belong to the scene."""
     g = scene.gaussians
     rows = ((g.opacities > MIN_PARTICLE_OPACITY) & (g.means.abs() <= HALF_EXTENT).all(1)).nonzero()[:, 0]
     positions = read_frame(first, "pos", (3,))
@@ -148,7 +148,7 @@ def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
 
 
 def _choose_keypoints(scene: Scene, rows: Int[Tensor, "r"], count: int) -> tuple[Int[Tensor, "k"], Keypoints]:
-    """Evenly spaced rows of each object, and their rest positions."""
+    """Evenly distributed rows of each object, and the keypoints at their rest positions."""
     if count < 1:
         raise InputError(f"--keypoints {count}: at least 1 per object")
     g, chosen = scene.gaussians, []
@@ -168,7 +168,7 @@ def _read_positions(frames: list[Path], count: int) -> Iterator[Float[Tensor, "r
 
 
 def read_frame(path: Path, name: str, shape: tuple[int, ...]) -> Tensor:
-    """Dataset `name` of a frame, (n, *shape), as float32."""
+    """Dataset `name` of a frame, of shape (n, *shape), as float32."""
     must_exist(path, FILE_KIND)
     try:
         with h5py.File(path, "r") as file:

@@ -4,8 +4,8 @@ A file NAME.h5 holds one group of scenes:
 
     attributes    format = "ngff-motions", version, dt [s], gravity [m/s^2], box (2,3) [m], provenance (JSON)
     names (s)     objects (s,o) ids of GSCollision, -1: no object
-    points        (s,t,o,n,3) int16, in steps of `step` [m] (an attribute of the dataset)
-    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; files without solidity hold hollow or thin bodies only
+    points        (s,t,o,n,3) int16, in units of `step` [m] (an attribute of the dataset)
+    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; without solidity, all bodies are hollow or thin
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json,
 
 FORMAT, VERSION = "ngff-motions", 1
 POSITION_STEP = 1e-4  # quantisation of the stored positions [m]: int16 spans 3.2 m around the origin
-COMPRESSION_LEVEL = 1  # of zlib
-MAX_THREADS = 8  # that compress
+COMPRESSION_LEVEL = 1  # zlib level
+MAX_THREADS = 8  # maximum number of compression threads
 FILE_KIND = "keypoint trajectories (.h5), such as `ngff-lab dataset` writes"
 
 
@@ -81,7 +81,7 @@ class KeypointMotions:
         )  # fmt: skip
 
 
-DATASETS = {  # as stored; s scenes, t frames, o objects, n keypoints
+DATASETS = {  # schema of the file; s scenes, t frames, o objects, n keypoints
     "names": Dataset("s", "text"),
     "objects": Dataset("s o", "int", -1, MAX_OBJECT_ID),
     "points": Dataset("s t o n 3", "int"),
@@ -95,7 +95,7 @@ TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
 
 
 def concatenate_motions(parts: Sequence[KeypointMotions]) -> KeypointMotions:
-    """All scenes of several groups; scenes with fewer objects than the largest are padded."""
+    """All scenes of several groups; scenes with fewer objects than the maximum are padded."""
     max_objects = max(p.objects.shape[1] for p in parts)
 
     def padded(p: KeypointMotions, name: str) -> Tensor:
@@ -110,10 +110,10 @@ def concatenate_motions(parts: Sequence[KeypointMotions]) -> KeypointMotions:
 
 
 class KeypointMotionsWriter:
-    """Writes the scenes of a group batch by batch; the file appears on success only.
+    """Writes the scenes of a group batch by batch; the file appears only on success.
 
     Threads compress the scenes while the next batch is simulated. All scenes must have the same shape. Leaving the
-    context raises InputError when no scene was appended.
+    context raises InputError if no scene was appended.
     """
 
     def __init__(self, path: Path, provenance: dict):
@@ -129,7 +129,7 @@ class KeypointMotionsWriter:
         """Add the scenes of one batch."""
         steps = (part.points / POSITION_STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
         self._compressed += [self._pool.submit(_compress, scene) for scene in steps]
-        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # only the shape is needed
+        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # keeps only the shape
 
     def __exit__(self, kind, error, trace) -> None:
         with self._pool as pool:
@@ -161,19 +161,19 @@ class KeypointMotionsWriter:
 
 
 def _compress(steps: np.ndarray) -> bytes:
-    """A chunk as HDF5's shuffle and gzip filters produce it: all low bytes, then all high bytes, compressed."""
+    """A chunk in the form of HDF5's shuffle and gzip filters: all low bytes, then all high bytes, compressed."""
     shuffled = np.ascontiguousarray(steps, "<i2").view(np.uint8).reshape(-1, 2).T
     return zlib.compress(shuffled.tobytes(), COMPRESSION_LEVEL)
 
 
 def write_motions(path: Path, motions: KeypointMotions, provenance: dict) -> None:
-    """Write a group at once."""
+    """Write a group in a single batch."""
     with KeypointMotionsWriter(path, provenance) as file:
         file.append(motions)
 
 
 def read_provenance(path: Path) -> dict:
-    """The provenance stored in a file of keypoint trajectories; raises InputError when the file is missing."""
+    """The provenance stored in a file of keypoint trajectories. Raises InputError if the file cannot be read."""
     must_exist(path, FILE_KIND)
     try:
         with open_h5(path) as file:
@@ -184,7 +184,7 @@ def read_provenance(path: Path) -> dict:
 
 
 def read_motions(path: Path) -> KeypointMotions:
-    """Read a file of keypoint trajectories; raises InputError when it is missing or has another format."""
+    """Read a file of keypoint trajectories. Raises InputError if it is missing or has another format."""
     must_exist(path, FILE_KIND)
     try:
         with open_h5(path) as file:
@@ -214,15 +214,15 @@ def read_motions(path: Path) -> KeypointMotions:
 
 
 def motions_folder(folder: Path) -> Path:
-    """The folder of a data set's motions: its subfolder `motions` if there is one, else the folder itself."""
+    """The folder of a data set's motions: its subfolder `motions` if it exists, otherwise the folder itself."""
     inner = Path(folder) / "motions"
     return inner if inner.is_dir() else Path(folder)
 
 
 def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> KeypointMotions:
-    """Scenes of NAME.h5 in a folder, with the first `keypoints` of each object.
+    """Read the scenes of NAME.h5 in a folder, with the first `keypoints` of each object.
 
-    Raises InputError for missing files, too few keypoints, and groups of different lengths.
+    Raises InputError for missing files, too few keypoints, and groups with different numbers of frames.
     """
     folder = motions_folder(folder)
     missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]

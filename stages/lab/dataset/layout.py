@@ -21,7 +21,7 @@ from stages.core.scene.files import replacing
 from stages.lab.assets.backgrounds import BACKGROUND_PLY
 from stages.lab.assets.objects import OBJECTS, POINT_CLOUD, ObjectKind
 
-SCENE_PARTS = ("scenes", "mpm", "initial", "dynamic")  # those with files for each scene
+SCENE_PARTS = ("scenes", "mpm", "initial", "dynamic")  # parts with files for each scene
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Layout:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """An empty folder next to `path` that is renamed to `path` on success and removed on failure.
 
-    A leftover of an earlier, killed run is removed first. Raises InputError when it cannot be written.
+    A leftover of an earlier, killed run is removed first. Raises InputError if the folder cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
@@ -81,5 +81,5 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def object_kind(object_id: int) -> ObjectKind:
-    """The ObjectKind with this published id."""
+    """The object kind with this published id."""
     return next(kind for kind in OBJECTS.values() if kind.id == object_id)

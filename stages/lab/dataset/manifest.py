@@ -1,4 +1,4 @@
-"""Settings of a data set and the sha256 of every file, to reproduce and verify it.
+"""Manifest of a data set: its settings and the sha256 of every file, to reproduce and verify it.
 
 OUT/manifest.json         settings shared by all files, package versions, and a digest of the solver's sources
 OUT/sums/<group>.sha256   in the format of `sha256sum`; `sha256sum -c sums/*.sha256` in OUT verifies them too
@@ -21,12 +21,12 @@ from stages.core.scene.schema import read_json
 
 FORMAT, VERSION = "ngff-dataset", 1
 SOLVER_SOURCES = ("core/physics/mpm/*.py", "core/kernels/mpm/*.py")  # under stages/
-UNLISTED_FILES = ("manifest.json", "particles.npz")  # besides the folder sums/
-MAX_REPORTED = 5  # wrong files named in an error
+UNLISTED_FILES = ("manifest.json", "particles.npz")  # files without checksums, besides the folder sums/
+MAX_REPORTED = 5  # largest number of wrong files named in an error
 
 
 def open_manifest(root: Path, settings: dict) -> None:
-    """Write the manifest, or raise InputError when the existing one has other settings or another solver."""
+    """Write the manifest, or raise InputError if the existing one has other settings or another solver."""
     path, current = root / "manifest.json", {"settings": settings, "solver": solver_digest()}
     if path.exists():
         try:
@@ -44,7 +44,7 @@ def open_manifest(root: Path, settings: dict) -> None:
 
 
 def _installed(name: str) -> bool:
-    """Whether a package has metadata; one that was put on the path by hand has none."""
+    """Whether a package has metadata; packages put on the import path by hand have none."""
     try:
         return bool(version(name))
     except PackageNotFoundError:
@@ -71,7 +71,7 @@ def solver_digest() -> str:
 
 
 def write_checksums(root: Path, name: str, files: Iterable[Path]) -> None:
-    """List exactly these files in sums/<name>.sha256; files already listed are not hashed again."""
+    """List exactly these files in sums/<name>.sha256; files that are already listed are not hashed again."""
     path = root / "sums" / f"{name}.sha256"
     listed = read_checksums(path) if path.exists() else {}
     names = sorted(file.relative_to(root).as_posix() for file in files)
@@ -84,7 +84,7 @@ def write_checksums(root: Path, name: str, files: Iterable[Path]) -> None:
 
 
 def read_checksums(path: Path) -> dict[str, str]:
-    """File name -> digest, from a file as `sha256sum` writes it; raises InputError for other content."""
+    """Digests by file name, from a file in the format of `sha256sum`. Raises InputError for other content."""
     rows = [line.split("  ", 1) for line in path.read_text(errors="replace").splitlines() if line]
     if not all(len(row) == 2 and len(row[0]) == 64 for row in rows):
         raise InputError(f"{path}: is not a list of sha256 digests; remove it and run `ngff-lab dataset` again")
@@ -92,7 +92,10 @@ def read_checksums(path: Path) -> dict[str, str]:
 
 
 def verify_files(root: Path) -> int:
-    """Number of listed files; raises InputError when one is missing or changed, or a file is not listed."""
+    """Verify all files and return the number of listed files.
+
+    Raises InputError if a listed file is missing or changed, or a file is not listed.
+    """
     lists = sorted((root / "sums").glob("*.sha256"))
     if not lists:
         raise InputError(f"{root}: has no sums/*.sha256; it is not a data set of `ngff-lab dataset`, or incomplete")

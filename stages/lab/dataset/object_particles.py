@@ -1,4 +1,4 @@
-"""The ten objects as MPM particles: sampled from their Gaussians at the grid's resolution, cached in a file."""
+"""The data set's ten objects as MPM particles, sampled from their Gaussians at grid resolution and cached in a file."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import PlacementExtent
 
 POISSON_RATIO = 0.3  # of all objects, as published
-FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a coefficient of 1 or more
-PLACEMENT_POINTS = 2048  # first particles of an object, of which distances between objects are computed
+FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a Coulomb coefficient of 1 or more
+PLACEMENT_POINTS = 2048  # number of particles of an object from which distances between objects are computed
 
 
 @dataclass(frozen=True)
 class Asset:
-    """An object as particles, at its scale prior, about the centre of its bounding box."""
+    """An object as particles at its scale prior, relative to the centre of its bounding box."""
 
     id: int
     scale: float
@@ -50,7 +50,7 @@ class Asset:
         return self.density * float(self.volume.sum())
 
     def particles(self, device: str = "cpu") -> mpm.Particles:
-        """The object at rest about the origin."""
+        """The particles of the object at rest about the origin."""
         material = mpm.ParticleMaterial(self.E, POISSON_RATIO, self.density, 0.0, FRICTION)
         made = mpm.at_rest(self.points, self.volume, material, MODELS["corotated"].kernel)
         return mpm.Particles(*(getattr(made, f.name).to(device) for f in fields(made)))
@@ -64,8 +64,8 @@ def translated(particles: mpm.Particles, offset: tuple[float, float, float]) -> 
 def load_assets(discretisation: Discretisation, min_particles: int, cache: Path | None = None) -> dict[int, Asset]:
     """The ten objects by id, each with `min_particles` particles or as many as the particle spacing requires.
 
-    An object with fewer Gaussians than the spacing requires takes all of them. Sampling takes about a minute; `cache`
-    is a file (.npz) from which the particles are read, or to which they are written. Raises InputError when an object
+    An object with fewer Gaussians than the spacing requires uses all of them. Sampling takes about a minute; `cache`
+    is a file (.npz) from which the particles are read, or to which they are written. Raises InputError if an object
     has fewer than `min_particles` Gaussians or the cache cannot be read.
     """
     key = f"spacing {discretisation.spacing} least {min_particles}"
@@ -87,7 +87,7 @@ def cached_points(
 ) -> dict[str, Float[Tensor, "p 3"]]:
     """Particle positions by object name, from the file `cache` if it was written with the same `key`.
 
-    Otherwise they are sampled, and written to the file. Raises InputError when the file cannot be read.
+    Otherwise they are sampled and written to the file. Raises InputError if the file cannot be read.
     """
     if cache is not None and cache.exists():
         arrays = read_npz(cache, "particles of objects, which are made again where there is no such file")
@@ -103,14 +103,14 @@ def cached_points(
 
 
 def at_scale_prior(g: Gaussians, scale: float) -> Gaussians:
-    """An object's Gaussians scaled by its scale prior, centred on the bounding box of the opaque ones [m]."""
+    """An object's Gaussians scaled by its scale prior and centred on the bounding box of the opaque ones [m]."""
     means = g.means * scale
     opaque = means[g.opacities > MIN_PARTICLE_OPACITY]
     return replace(g, means=means - (opaque.amax(0) + opaque.amin(0)) / 2, scales=g.scales * scale)
 
 
 def _sample_particles(kind: ObjectKind, discretisation: Discretisation, min_particles: int) -> Float[Tensor, "p 3"]:
-    """Centres of some of the object's Gaussians, by farthest-point sampling."""
+    """Centres of a subset of the object's Gaussians, chosen by farthest-point sampling."""
     g = at_scale_prior(make_object(kind.name), kind.scale)
     means = g.means[g.opacities > MIN_PARTICLE_OPACITY]
     if len(means) < min_particles:
@@ -121,19 +121,19 @@ def _sample_particles(kind: ObjectKind, discretisation: Discretisation, min_part
 
 
 def count_for_spacing(means: Float[Tensor, "n 3"], spacing: float) -> int:
-    """Number of points with the given spacing [m] on the surface that `means` sample, from their own spacing."""
+    """Number of points that sample a surface with the given spacing [m], estimated from the spacing of `means`."""
     sample = means[:: max(1, len(means) // 4000)]
     own_spacing = float(knn(means, sample, 5)[0][:, 1:].mean())
     return int(len(means) * (own_spacing / spacing) ** 2)
 
 
 def particle_volumes(means: Float[Tensor, "n 3"], dx: float) -> Float[Tensor, "n"]:
-    """The volume of a grid cell divided by the number of particles in it [m^3], as published."""
+    """Volume of a grid cell divided by the number of particles in it [m^3], for each particle, as published."""
     cell = (means / dx).floor().long()
     _, owner, count = cell.unique(dim=0, return_inverse=True, return_counts=True)
     return dx**3 / count[owner].float()
 
 
 def placement_extents(assets: Mapping[int, Asset]) -> dict[int, PlacementExtent]:
-    """Points and scale of each object, for its placement in scenes."""
+    """Points and scale of each object, for placing it in scenes."""
     return {i: PlacementExtent(a.points[:PLACEMENT_POINTS].numpy().astype(float), a.scale) for i, a in assets.items()}

@@ -19,13 +19,13 @@ from stages.lab.dataset.selection import (
     parse_views,
 )
 
-FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # as published [s]
-PREREQUISITES = {  # parts that a part is generated from
+FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # time steps as published [s]
+PREREQUISITES = {  # parts from which each part is generated
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
-MIN_DX = 0.011  # of which the grid of a scene has about 50 million nodes [m]
-MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
+MIN_DX = 0.011  # smallest grid spacing, at which the grid of a scene has about 50 million nodes [m]
+MAX_NUDGE = 0.02  # largest shift of an object [m]; scenes leave 0.05 m between objects
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class DatasetOptions(Discretisation):
 
     @property
     def view_indices(self) -> tuple[int, ...]:
-        """Orbit cameras of the dynamic videos and of the depth maps."""
+        """Indices of the orbit cameras used for the dynamic videos and the depth maps."""
         return parse_views(self.views)
 
     @property
@@ -112,13 +112,13 @@ class DatasetOptions(Discretisation):
     def deterministic(self) -> bool:
         """Whether the simulation must be bitwise reproducible.
 
-        Always so for mpm and dynamic: missing scenes of these are simulated again separately.
+        Always so for mpm and dynamic, because their missing scenes are simulated again separately.
         """
         return self.exact or bool({"mpm", "dynamic"} & {*self.needed_parts})
 
     @property
     def settings(self) -> dict:
-        """The settings common to all files of a data set, as stored in manifest.json."""
+        """The settings shared by all files of a data set, as stored in manifest.json."""
         shared = ("frames", "keypoints", "dx", "spacing", "substep", "nudge", "resolution")
         return {**{name: getattr(self, name) for name in shared}, "exact": self.deterministic}
 
@@ -158,7 +158,7 @@ class HeldoutOptions(Discretisation):
             raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
 
     def group(self, meshes: bool) -> str:
-        """Kind of the group of scenes, of meshes or not."""
+        """Name of the group of scenes, depending on whether meshes are given."""
         random = MESHES if meshes else SOLID if self.solid else VARIED
         return random if self.shapes else ROTATED if self.rotations else HELDOUT
 

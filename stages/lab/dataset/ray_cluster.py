@@ -7,8 +7,8 @@ of ngff and Python:
     ray start --address=HEAD:6379           # on each of the others
     ngff-lab dataset /shared/OUT --ray auto # on any of them; or --ray ray://HEAD:10001 from outside
 
-With `--ray local` Ray is started on this machine alone, to use all its GPUs. Groups are independent, and the
-unfinished groups of a failed machine are made again by another: files appear complete or not at all.
+With `--ray local` Ray is started on this machine alone, to use all its GPUs. Groups are independent and files are
+written atomically, so the unfinished groups of a failed machine are repeated on another one.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from stages.lab.dataset.options import DatasetOptions
 
 
 def run(out: Path, options: DatasetOptions, address: str) -> None:
-    """Write all missing files, as generate.run does, with one task per group and one GPU per task if there are any.
+    """Write all missing files, like generate.run, with one task per group and one GPU per task if there are any.
 
-    `address` is "local", "auto" or the address of a cluster. Raises MissingPackage without Ray, and InputError when
-    the cluster does not answer, or has no GPU though --device cuda was given, and for --device cuda:N.
+    `address` is "local", "auto" or the address of a cluster. Raises MissingPackage without Ray, and InputError if the
+    cluster does not answer, if it has no GPU for --device cuda, and for --device cuda:N.
     """
     if options.device.startswith("cuda:"):
         raise InputError(f"--device {options.device}: Ray gives each task a GPU of its own; give --device cuda")
@@ -37,7 +37,7 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
     except ImportError as error:
         raise MissingPackage("--ray: Ray is not installed; install it with `pip install 'ngff[ray]'`") from error
     out = Path(out).resolve()
-    generator = DatasetGenerator(out, options)  # makes the inputs shared by all groups, before the tasks start
+    generator = DatasetGenerator(out, options)  # makes the inputs shared by all groups before the tasks start
     generator.make_shared()
     require_disk_space(out, missing_bytes(generator.layout, options))
     _ = generator.assets
@@ -61,5 +61,5 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
 
 
 def _make_group(out: Path, options: DatasetOptions) -> None:
-    """Task: make one group; objects and backgrounds exist already."""
+    """Task that makes one group; objects and backgrounds exist already."""
     DatasetGenerator(out, options).make_group(options.groups)

@@ -1,4 +1,4 @@
-"""Resolution study: the same scenes simulated at several resolutions, compared with the published one."""
+"""Resolution study: the same scenes simulated at several resolutions and compared with the published resolution."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import perturbed, sample_group
 from stages.lab.dataset.simulation import SimulationSettings, simulate
 
-FULL_SPACING = 1e-6  # particle spacing that takes all Gaussians [m]
-FRAMES, KEYPOINTS = 80, 512
+FULL_SPACING = 1e-6  # particle spacing at which all Gaussians are used [m]
+FRAMES, KEYPOINTS = 80, 512  # of each scene, and of each object
 PUBLISHED_RESOLUTION = Discretisation(0.02, FULL_SPACING, 1e-4)
 COMPARED_RESOLUTIONS = (
     Discretisation(0.02, 0.009, 1e-4), Discretisation(0.02, 0.0125, 1e-4), Discretisation(0.02, 0.009, 2e-4),
@@ -38,17 +38,17 @@ COMPARED_RESOLUTIONS = (
 
 @dataclass(frozen=True)
 class ResolutionResult:
-    """Errors of one resolution relative to the full one."""
+    """Errors of one resolution relative to the published resolution with all particles."""
 
     dx: float  # grid spacing [m]
-    particles: float  # per scene, mean
-    per_cell: float  # particles per occupied cell, mean
+    particles: float  # mean per scene
+    per_cell: float  # mean number of particles per occupied cell
     substep: float  # [s]
-    rmse: float  # averaged over scenes [m]
-    rmse_median: float  # over scenes [m]
-    fpe: float  # final position error, averaged over scenes [m]
-    torn: float  # fraction of keypoint pairs that end more than 1.5 rest distances and 4 cells apart
-    scenes: int  # simulated successfully
+    rmse: float  # mean over scenes [m]
+    rmse_median: float  # median over scenes [m]
+    fpe: float  # final position error, mean over scenes [m]
+    torn: float  # fraction of neighbouring keypoint pairs that end more than 1.5 rest distances and 4 cells apart
+    scenes: int  # number of successful simulations
     seconds: float
 
 
@@ -82,7 +82,7 @@ def _table_row(label: str, r: ResolutionResult) -> str:
 
 
 def _subsampled(a: Asset, discretisation: Discretisation) -> Asset:
-    """The asset with fewer particles: the first ones, since they are in farthest-point order."""
+    """The asset with only its first particles, which are well distributed because of the farthest-point order."""
     points = a.points[: max(KEYPOINTS, count_for_spacing(a.points, discretisation.spacing))]
     return replace(a, points=points, volume=particle_volumes(points, discretisation.dx))
 
@@ -110,7 +110,7 @@ def _measure(
 
 
 def _torn_fraction(m: KeypointMotions, discretisation: Discretisation) -> float:
-    """Fraction of pairs of neighbouring keypoints (at rest) that are far apart in the last frame."""
+    """Fraction of pairs of keypoints that are neighbours at rest but far apart in the last frame."""
     first, last = m.points[:, 0].flatten(0, 1), m.points[:, -1].flatten(0, 1)
     near = torch.cdist(first, first).topk(5, largest=False)
     rest, index = near.values[..., 1:], near.indices[..., 1:]

@@ -1,7 +1,7 @@
-"""Sampling of GSCollision scenes: which objects, and where they start.
+"""Sampling of GSCollision scenes: which objects they have, and where these start.
 
-Objects are drawn with replacement, have their scale prior, are not rotated, and each is placed near one placed before.
-There is no explicit tower or containment: both arise from the small horizontal offsets.
+Objects are drawn with replacement, have their scale prior and are not rotated; each is placed near an earlier one.
+Towers and containment are not constructed explicitly; both arise from the small horizontal offsets.
 Source: the NGFF paper, appendix on GSCollision, and the public sampling code (seed 42).
 """
 
@@ -22,12 +22,12 @@ from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.schema import number, numbers, quote, read_json, reason, rows, whole
 from stages.lab.dataset.selection import MORE_GROUPS, SCENE_COUNTS, object_count
 
-SEED = 42
-HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
-MIN_GAP = 0.05  # between points of two objects, and between their centres [m]
-MAX_OFFSET = 0.1  # horizontal, from the object placed before, in scenes of up to 4 objects [m]
-MAX_PLACEMENTS = 500  # attempts to place an object before its scene is drawn again
-MAX_DRAWS = 200  # of the objects of a scene
+SEED = 42  # of the public sampling code
+HALF_EXTENT = 0.9  # half side of the cube that contains all bounding spheres [m]
+MIN_GAP = 0.05  # smallest distance between points of two objects, and between their centres [m]
+MAX_OFFSET = 0.1  # largest horizontal offset from an earlier object, per axis, in scenes of up to 4 objects [m]
+MAX_PLACEMENTS = 500  # attempts to place an object before the objects of the scene are drawn again
+MAX_DRAWS = 200  # largest number of times that the objects of a scene are drawn
 SCENE_NAME = re.compile(r"[\w-][\w.-]{0,199}")  # no separators, not hidden, not ".."
 
 
@@ -43,7 +43,7 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class PlacementExtent:
-    """Points of an object at its scale prior, about the centre of its bounding box [m]."""
+    """Points of an object at its scale prior, relative to the centre of its bounding box [m]."""
 
     points: np.ndarray  # (n, 3)
     scale: float
@@ -65,7 +65,7 @@ class PlacementExtent:
 
 
 def sample_group(group: str, extents: Mapping[int, PlacementExtent]) -> dict[str, SceneConfig]:
-    """All scenes of a group by name, always the same: each scene has its own seed."""
+    """All scenes of a group by name; deterministic, since each scene has its own seed."""
     count, first = object_count(group), 300 * int(group.split("_")[1]) if "_" in group else 0
     first += 3000 * (group in MORE_GROUPS)
     made = (sample_scene(first + i, count, extents) for i in range(SCENE_COUNTS[group]))
@@ -84,7 +84,7 @@ def perturbed(configs: Mapping[str, SceneConfig], distance: float) -> dict[str, 
 
 
 def sample_scene(index: int, count: int, extents: Mapping[int, PlacementExtent]) -> SceneConfig:
-    """Scene `index` with `count` objects; raises InputError when the objects are too large to be placed."""
+    """Scene `index` with `count` objects. Raises InputError if the objects are too large to be placed."""
     rng = np.random.default_rng([SEED, count, index])
     ids = sorted(extents)
     for _ in range(MAX_DRAWS):
@@ -102,7 +102,7 @@ def sample_scene(index: int, count: int, extents: Mapping[int, PlacementExtent])
 def _place_objects(
     rng: np.random.Generator, chosen: list[int], extents: Mapping[int, PlacementExtent]
 ) -> list[np.ndarray] | None:
-    """Positions of the objects, the first at the origin; None when one could not be placed."""
+    """Positions of the objects, the first at the origin; None if an object could not be placed."""
     positions = [np.zeros(3)]
     for k, i in enumerate(chosen[1:], start=1):
         for _ in range(MAX_PLACEMENTS):
@@ -122,7 +122,7 @@ def _place_objects(
 
 
 def _separated(offset: np.ndarray, a: PlacementExtent, b: PlacementExtent) -> bool:
-    """Whether object a at `offset` from b has a disjoint bounding box and keeps MIN_GAP from its centre and points."""
+    """Whether object a at `offset` from b has a disjoint bounding box and keeps MIN_GAP from b's centre and points."""
     if (np.abs(offset) < a.half + b.half).all() or np.linalg.norm(offset) < MIN_GAP:
         return False
     near = (np.abs(a.points + offset) < b.half + MIN_GAP).all(1)
@@ -143,7 +143,7 @@ def write_scene_configs(path: Path, configs: Mapping[str, SceneConfig]) -> None:
 def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
     """Scene configurations by name from a JSON file.
 
-    Raises InputError when it has another format, or a scene name that is not a plain file name, since names become
+    Raises InputError if it has another format, or a scene name that is not a plain file name, since names become
     files and folders of the data set.
     """
     must_exist(path, "scene configurations (.json)")

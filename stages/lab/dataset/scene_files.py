@@ -1,4 +1,4 @@
-"""The parts of the data set with files for each scene: Gaussians at rest and in motion, and videos of them."""
+"""Writing of the data set parts that have files for each scene: Gaussians at rest and in motion, and videos of them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from stages.lab.dataset.scene_configs import SceneConfig
 from stages.lab.dataset.simulation import SimulationSettings, simulation_batches, valid_scenes
 from stages.lab.dataset.videos import write_dynamic, write_initial
 
-MAX_BATCH_PARTICLES = 400_000  # when all frames of a batch are kept: 2 GB for 100 frames
+MAX_BATCH_PARTICLES = 400_000  # particles per batch if all frames are kept in memory: 2 GB for 100 frames
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SceneAssets:
 
     particles: Mapping[int, Asset]
     skins: Mapping[int, ObjectSkin]
-    backgrounds: Mapping[str, Gaussians]  # on the device
+    backgrounds: Mapping[str, Gaussians]  # on the rendering device
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MissingFiles:
 
     scene: bool
     mpm: bool
-    initial: tuple[str, ...]  # backgrounds
+    initial: tuple[str, ...]  # names of backgrounds
     dynamic: dict[str, dict[int, Path]]  # background -> view -> video
 
     @property
@@ -68,7 +68,7 @@ class GroupFiles:
     device: str
 
     def missing(self, scene: str) -> MissingFiles:
-        """Files of the requested parts that do not exist."""
+        """The files of the requested parts that do not exist."""
         layout, group = self.layout, self.group
         parts, backgrounds = self.options.needed_parts, self.options.background_names
         videos = {}
@@ -85,7 +85,7 @@ class GroupFiles:
         )
 
     def write_rest(self, config: SceneConfig, missing: MissingFiles, assets: SceneAssets) -> None:
-        """Write the missing files of a scene that show its first frame."""
+        """Write the missing files of a scene that show only its first frame."""
         if missing.scene:
             path = self.layout.scene(self.group, config.name)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ class GroupFiles:
     def write_motion(
         self, config: SceneConfig, missing: MissingFiles, assets: SceneAssets, frames: Sequence[BatchFrame]
     ) -> None:
-        """Write the missing files of a scene that show its simulated frames."""
+        """Write the missing files of a scene that show its motion."""
         scene = SkinnedScene(config, assets.skins, assets.particles, self.device)
         x, F = [frame.x for frame in frames], [frame.F for frame in frames]
         if missing.mpm:
@@ -113,9 +113,9 @@ class GroupFiles:
 def write_scene_files(
     files: GroupFiles, configs: Mapping[str, SceneConfig], load_assets: Callable[[], SceneAssets]
 ) -> None:
-    """Write the missing files of all scenes; `load_assets` is called only when there are any.
+    """Write the missing files of all scenes; `load_assets` is called only if there are any.
 
-    A scene whose simulation fails is logged and gets no files of its motion.
+    A scene whose simulation fails is logged, and no files of its motion are written.
     """
     options = files.options
     todo = {name: missing for name in configs if (missing := files.missing(name))}

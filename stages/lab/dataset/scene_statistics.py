@@ -7,7 +7,7 @@ All are measured on keypoints, in scene units:
     stacked     at the end the object rests in contact with another one, above the floor
     contained   at the end the lowest quarter of the object is below the rim of an upright bowl and its
                 centre within the radius of the bowl
-    tipped      the object's own vertical axis ends more than TIP_ANGLE from its start
+    tipped      at the end the object's own vertical axis is more than TIP_ANGLE from its initial direction
     spread      mean horizontal distance of the objects' centres from their mean, at the end [m]
     deformation RMS distance of the points from the best rigid fit, divided by the RMS radius; maximum over time
     at rest     the points move slower than REST_SPEED, averaged over the last five frames
@@ -33,14 +33,14 @@ from stages.core.scene.files import replacing
 from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_motions
 from stages.lab.dataset.layout import object_kind
 
-FALL_HEIGHT, CONTACT_DISTANCE, REST_SPEED = 0.05, 0.04, 0.05  # [m], [m], [m/s]
-TIP_ANGLE = 30.0  # [deg]
+FALL_HEIGHT, CONTACT_DISTANCE, REST_SPEED = 0.05, 0.04, 0.05  # thresholds, see above [m], [m], [m/s]
+TIP_ANGLE = 30.0  # threshold of `tipped` [deg]
 FLOOR_CLEARANCE = (
-    0.04  # largest height of the lowest point of an object on the floor [m]: bodies stop about a cell above it
+    0.04  # largest height of the lowest point of an object that lies on the floor [m]: bodies stop a cell above it
 )
 BOWL = "bowl"
 CONTACT_STRIDE = 2  # frames between contact tests
-SCENE_BATCH = 20  # scenes measured at once
+SCENE_BATCH = 20  # scenes measured together
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SceneStatistics:
 
 
 def compute_statistics(m: KeypointMotions) -> SceneStatistics:
-    """All statistics, of scenes that fit into memory together."""
+    """All statistics of a batch of scenes, which must fit into memory."""
     p, present = m.points, m.present
     centre = p.mean(3)
     R, deformation = _rigid_fit(p, centre)
@@ -98,14 +98,14 @@ def _rigid_fit(
     """Rotation of each object since the start (Kabsch 1976), and the relative RMS residual of its points."""
     now = p - centre[..., None, :]
     rest = now[:, :1]
-    H = (now.mT @ rest).cpu().double()  # small matrices are decomposed faster there
+    H = (now.mT @ rest).cpu().double()  # decompositions of small matrices are faster on the CPU
     R = nearest_rotation(H + 1e-9 * torch.eye(3, dtype=H.dtype)).to(p)
     residual = (now - rest @ R.mT).square().sum(-1).mean(-1).sqrt()
     return R, residual / rest.square().sum(-1).mean(-1).sqrt().clamp_min(1e-9)
 
 
 def _pair_distances(p: Float[Tensor, "s t o n 3"]) -> Float[Tensor, "s t2 q"]:
-    """Smallest distance between points of each pair of objects [m], in every second frame and the last."""
+    """Smallest distance between points of each pair of objects [m], in every CONTACT_STRIDE-th frame and the last."""
     frames = sorted({*range(0, p.shape[1], CONTACT_STRIDE), p.shape[1] - 1})
     p = p[:, frames]
     found = [torch.cdist(p[:, :, i], p[:, :, j]).amin((-1, -2)) for i, j in combinations(range(p.shape[2]), 2)]
@@ -130,9 +130,9 @@ def _contained(m: KeypointMotions, tilt: Float[Tensor, "s o"]) -> Bool[Tensor, "
 
 
 def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, device: str) -> list[str]:
-    """Measure the statistics of each group and kind of object, write JSON to `out`, return the lines of two tables.
+    """Measure the statistics of each group and kind of object, write JSON to `out`, and return the lines of two tables.
 
-    Only the first `keypoints` of each object are used. Raises InputError when the data set has none of the groups.
+    Only the first `keypoints` of each object are used. Raises InputError if the data set has none of the groups.
     """
     device, table, kinds = pick_device(device), {}, {}
     for group in groups:
@@ -169,8 +169,8 @@ THRESHOLDS = {
     "still": REST_SPEED,
     "tipped": TIP_ANGLE,
     "on floor": FLOOR_CLEARANCE,
-}  # as written to the JSON file
-OBJECT_FRACTIONS = ("falls", "tipped", "stacked", "contained", "at_rest")  # of objects
+}  # thresholds as written to the JSON file
+OBJECT_FRACTIONS = ("falls", "tipped", "stacked", "contained", "at_rest")  # reported as fractions of objects
 
 
 def _first_keypoints(m: KeypointMotions, keypoints: int) -> KeypointMotions:
@@ -178,7 +178,7 @@ def _first_keypoints(m: KeypointMotions, keypoints: int) -> KeypointMotions:
 
 
 def group_summary(f: SceneStatistics) -> dict[str, float]:
-    """Fraction of objects with each property, of scenes in which any object has it, and means of the other values."""
+    """Fractions of objects and of scenes with each property, and means of the other values."""
     out = {name: _round(getattr(f, name).nanmean()) for name in OBJECT_FRACTIONS}
     out["contacts a scene"] = _round(f.touch.nansum(1).mean())
     for name in ("touch", "tipped", "stacked", "contained"):
@@ -191,7 +191,7 @@ def group_summary(f: SceneStatistics) -> dict[str, float]:
 
 
 def _object_summary(parts: list[tuple[SceneStatistics, Tensor]]) -> dict[str, float]:
-    """The same for all objects of one kind."""
+    """The statistics of all objects of one kind."""
     out: dict[str, float] = {"count": int(sum(int(mask.sum()) for _, mask in parts))}
     for name in (*OBJECT_FRACTIONS, "deformation"):
         out[name] = _round(torch.cat([getattr(f, name)[mask] for f, mask in parts]).nanmean())

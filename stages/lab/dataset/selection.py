@@ -1,31 +1,31 @@
-"""What of the data set is chosen by name: groups of scenes, parts, views and backgrounds."""
+"""Parsing of names that select parts of the data set: groups of scenes, parts, views and backgrounds."""
 
 import re
 
 from stages.core.errors import InputError
 
-HELDOUT = "heldout"  # group of scenes of eight other objects that are never trained on
-# groups of random shapes, solid random shapes, rotated objects, and objects made from meshes
+HELDOUT = "heldout"  # group of scenes with eight other objects that are never trained on
+# groups of random hollow shapes, random solid shapes, rotated objects, and objects made from meshes
 VARIED, SOLID, ROTATED, MESHES = "varied", "solid", "turned", "meshes"
 EXTRA_GROUPS = (VARIED, SOLID, ROTATED, MESHES)  # unpublished groups that may be trained on; also varied_1, ...
-MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of three objects, for training
-SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # scenes in each group
+MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of scenes with three objects, for training
+SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # number of scenes per group
 PARTS = ("scene_configs", "motions", "objects", "backgrounds", "scenes", "mpm", "initial", "dynamic")
-ORBIT_VIEWS = 100  # cameras around a scene, one frame each of an initial video
+ORBIT_VIEWS = 100  # number of cameras around a scene, each of which is a frame of an initial video
 VIDEO_VIEWS = tuple(range(0, ORBIT_VIEWS, 4))  # cameras of the dynamic videos
 
 
 def object_count(group: str) -> int:
-    """Number of objects in each scene of a group; raises InputError for an unknown group."""
+    """Number of objects in each scene of a group. Raises InputError for an unknown group."""
     if group not in SCENE_COUNTS:
         raise InputError(f"--groups {group}: choose from {', '.join(SCENE_COUNTS)}")
     return 3 if group in MORE_GROUPS else int(group.split("_")[0])
 
 
 def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
-    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are further names allowed, also with a number.
+    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"].
 
-    Raises InputError for an unknown group.
+    `more` are further allowed names, which may have a number appended. Raises InputError for an unknown group.
     """
     out: list[str] = []
     for part in text.split(","):
@@ -40,7 +40,7 @@ def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
 
 
 def parse_parts(text: str) -> tuple[str, ...]:
-    """Parse --parts: "mpm, scenes" -> ("scenes", "mpm"), in the order in which they are made; InputError if unknown."""
+    """Parse --parts: "mpm, scenes" -> ("scenes", "mpm"), in order of generation. Raises InputError if unknown."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = next((name for name in names if name not in PARTS), None)
     if unknown is not None or not names:
@@ -49,7 +49,7 @@ def parse_parts(text: str) -> tuple[str, ...]:
 
 
 def parse_views(text: str) -> tuple[int, ...]:
-    """Parse --views: "0,16" -> (0, 16); "all" gives the 25 published views; InputError for other cameras."""
+    """Parse --views: "0,16" -> (0, 16); "all" gives the 25 published views. Raises InputError for other cameras."""
     if text == "all":
         return VIDEO_VIEWS
     names = [name.strip() for name in text.split(",")]
@@ -59,8 +59,8 @@ def parse_views(text: str) -> tuple[int, ...]:
 
 
 def parse_backgrounds(text: str) -> tuple[str, ...]:
-    """Parse --backgrounds: "table0,table3" -> ("table0", "table3"); "all" gives all eight; InputError if unknown."""
-    from stages.lab.assets.backgrounds import BACKGROUNDS  # imports PyTorch, which --help does not wait for
+    """Parse --backgrounds: "table0,table3" -> ("table0", "table3"); "all" gives all. Raises InputError if unknown."""
+    from stages.lab.assets.backgrounds import BACKGROUNDS  # imports PyTorch, which would slow down --help
 
     names = tuple(BACKGROUNDS) if text == "all" else tuple(name.strip() for name in text.split(","))
     unknown = next((name for name in names if name not in BACKGROUNDS), None)

@@ -1,7 +1,7 @@
 """Sensitivity to initial conditions: errors between two runs of the same scenes with slightly displaced objects.
 
-A model given initial conditions of this precision cannot be expected to do better, so this is a lower bound on the
-error: `ngff-lab bench dynamics` measures models on the same splits by the same metrics.
+A model that knows the initial conditions only to this precision cannot be expected to do better, so the result is a
+lower bound on its error. `ngff-lab bench dynamics` evaluates models on the same splits with the same metrics.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from stages.evaluate.dynamics import all_metrics
 from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder, read_groups
 
 TRAINED = tuple(f"3_{i}" for i in range(9))
-SPLITS = {  # groups of scenes, and frames that are compared
+SPLITS = {  # groups of scenes, and number of frames compared
     "spatial": (("3_9",), 80), "temporal": (TRAINED, 100), "4 objects": (("4",), 80), "6 objects": (("6",), 80),
 }  # fmt: skip
-TEMPORAL_SCENES = 300  # random scenes of the temporal split
-SCENE_BATCH = 50  # scenes compared at once
+TEMPORAL_SCENES = 300  # number of random scenes in the temporal split
+SCENE_BATCH = 50  # scenes compared together
 METRICS = ("RMSE", "FPE", "PCE", "R", "R_pooled")
 
 
 def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str) -> list[str]:
     """Compare two data sets on each split that both have; write JSON to `out` and return the lines of a table.
 
-    Raises InputError when they have no group in common, or the start positions are equal.
+    Raises InputError if they have no group in common, or if the start positions are equal.
     """
     device, rows = pick_device(device), {}
     for split, (groups, frames) in SPLITS.items():
@@ -61,7 +61,7 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
 
 
 def common_scenes(a: KeypointMotions, b: KeypointMotions) -> tuple[KeypointMotions, KeypointMotions]:
-    """The scenes that both runs have, in the order of the first."""
+    """The scenes present in both runs, in the order of the first."""
     names_b = set(b.names)
     both = [n for n in a.names if n in names_b]
     return a[_rows(a, both)], b[_rows(b, both)]
@@ -77,9 +77,9 @@ def _first_frames(m: KeypointMotions, frames: int) -> KeypointMotions:
 
 
 def compare_motions(truth: KeypointMotions, other: KeypointMotions) -> dict[str, float | int]:
-    """Metrics of `other` as a prediction of `truth`, averaged over scenes, and the mean start distance [m].
+    """Metrics of `other` as a prediction of `truth`, averaged over scenes, and the mean distance at the start [m].
 
-    Scenes in which a metric is undefined (R without motion) are left out of its mean.
+    Scenes in which a metric is undefined (R without motion) are excluded from its mean.
     """
     found = []
     for first in range(0, len(truth), SCENE_BATCH):

@@ -1,8 +1,8 @@
 """Simulation of the scenes of the data set in batches, with the published physics.
 
-Fixed corotated bodies, transfer damping 0.9, walls that keep 0.9 of the tangential speed per substep of 1e-4 s,
-gravity 5 m/s^2, frames of 0.02 s. Particles are Gaussians of the surface, so bodies are hollow, except those of the
-group `solid`. Source: public code of NGFF. Other substeps are scaled to the same damping per second.
+Bodies are fixed corotated with transfer damping 0.9; walls keep 0.9 of the tangential speed per substep of 1e-4 s;
+gravity is 5 m/s^2; frames last 0.02 s. Particles are Gaussians on the surface, so bodies are hollow, except in the
+group `solid`. Source: public code of NGFF. For other substeps, damping is scaled to the same rate per second.
 """
 
 from __future__ import annotations
@@ -25,17 +25,19 @@ from stages.lab.dataset.options import FRAME_INTERVAL, SUBSTEP, Discretisation
 from stages.lab.dataset.scene_configs import SceneConfig
 
 log = logging.getLogger(__name__)
-TRANSFER_DAMPING = 0.9  # per published substep
-WALL_RETENTION = 0.9  # of the tangential speed at walls, per published substep
-MAX_COURANT = 0.68  # of a given substep, as of the bowl at the published one; shells gain energy from 0.7
-MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (BOX[1][2] - BOX[0][2]))  # from the ceiling to the floor [m/s]
-CPU_BATCH_SCENES = 4
-GPU_BATCH_PARTICLES = 1_500_000  # enough to occupy a GPU; more only take memory
+TRANSFER_DAMPING = 0.9  # damping of the particle-grid transfer, per published substep
+WALL_RETENTION = 0.9  # fraction of the tangential speed kept at walls, per published substep
+# Largest Courant number at which the given substep is kept, that of the bowl at the published substep; shells gain
+# energy from 0.7.
+MAX_COURANT = 0.68
+MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (BOX[1][2] - BOX[0][2]))  # for a fall from ceiling to floor [m/s]
+CPU_BATCH_SCENES = 4  # scenes per batch on a CPU
+GPU_BATCH_PARTICLES = 1_500_000  # particles per batch on a GPU: enough to occupy it; more would only use memory
 
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """Everything a simulation depends on besides the scenes and objects."""
+    """All inputs of a simulation other than scenes and objects."""
 
     discretisation: Discretisation
     frames: int
@@ -45,10 +47,10 @@ class SimulationSettings:
 
 
 def stable_substep(discretisation: Discretisation, materials: Iterable[tuple[float, float]]) -> float:
-    """The substep of `discretisation` [s], or one by the CFL condition if it is too long for some material.
+    """The substep of `discretisation`, or one from the CFL condition if it is too long for a material [s].
 
-    `materials` are Young's modulus [Pa] and density [kg/m^3] of each object; the fastest pressure wave counts. All
-    scenes of a group have the same substep, so that a scene does not depend on the others of its batch.
+    `materials` holds Young's modulus [Pa] and density [kg/m^3] of each object; the fastest pressure wave decides. All
+    scenes of a group have the same substep, so that a scene does not depend on the others in its batch.
     """
     E, density = max(materials, key=lambda m: m[0] / m[1])
     speed = mpm.wave_speed(E, POISSON_RATIO, density) + MAX_FALL_SPEED
@@ -65,7 +67,7 @@ def simulate(
 ) -> Iterator[KeypointMotions]:
     """Keypoint trajectories of all scenes, one batch at a time, on the device.
 
-    A scene whose simulation fails is logged and left out.
+    Scenes whose simulation fails are logged and left out.
     """
     device, frames = settings.device, settings.frames
     max_objects = max(len(c.ids) for c in configs.values())
@@ -83,7 +85,7 @@ def simulation_batches(
     configs: Mapping[str, SceneConfig], assets: Mapping[int, Asset], settings: SimulationSettings,
     max_particles: int = GPU_BATCH_PARTICLES,
 ) -> Iterator[tuple[list[SceneConfig], Batch]]:  # fmt: skip
-    """All scenes at rest, in batches of about equal size with at most about `max_particles` particles on a GPU."""
+    """Batches of scenes at rest, of about equal size, with at most about `max_particles` particles on a GPU."""
     dx, device = settings.discretisation.dx, settings.device
     low, high = BOX
     length = settings.discretisation.substep / SUBSTEP
@@ -105,7 +107,7 @@ def simulation_batches(
 
 
 def _max_batch_scenes(box: mpm.Box, particles: int, settings: SimulationSettings, max_particles: int) -> int:
-    """Scenes of `particles` particles per batch: as many as keep the device busy, limited by its memory."""
+    """Scenes per batch, if each has `particles` particles: enough to occupy the device, limited by its memory."""
     device = settings.device
     if device == "cpu":
         return CPU_BATCH_SCENES
@@ -125,7 +127,7 @@ def valid_scenes(scenes: Sequence[SceneConfig], batch: Batch) -> list[int]:
 def _keypoint_rows(
     scenes: Sequence[SceneConfig], assets: Mapping[int, Asset], keypoints: int, max_objects: int
 ) -> Int[Tensor, "s o n"]:
-    """Row of every keypoint among the particles of the batch; missing objects repeat the first one."""
+    """Row of every keypoint among the particles of the batch; missing objects repeat the rows of the first object."""
     start, out = 0, []
     for c in scenes:
         rows = []

@@ -1,13 +1,13 @@
-"""The videos of the data set, rendered as by `ngff render`: 100 views of the first frame, and views over time.
+"""Videos of the data set, rendered as by `ngff render`: 100 views of the first frame, and views over time.
 
     initial/<group>/<scene>/<background>/   <scene>.mp4    the first frame from every camera of the orbit
                                             cameras.json   the cameras of these frames
                                             prompts.json   center_point, bbox [px of view 0] and text of each object
-                                            depth.h5       depth (v,h,w) uint16 from 0 to depth_max, of the cameras
+                                            depth.h5       depth (v,h,w) uint16 from 0 to depth_max, for the cameras
                                                            `view`; 0: no surface
     dynamic/.../view_<i>/<scene>.mp4        the scene over time from camera i of the orbit
 
-Source: public code of NGFF; the published videos are MPEG-4 part 2, these are H.264.
+Source: public code of NGFF. The published videos are MPEG-4 part 2, these are H.264.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def write_initial(
 ) -> None:
     """Write the `initial` files of a scene over one background.
 
-    `rest` are its Gaussians in the first frame and `background` those behind it, on the same device; depth is stored
+    `rest` holds its Gaussians in the first frame and `background` those behind it, on the same device. Depth is stored
     for the orbit cameras `views`.
     """
     cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=background)

@@ -1,4 +1,4 @@
-"""Ablation benchmark: retrains the force field with one component removed, for as long and on the same data.
+"""Ablation benchmark: retrains the force field with one component removed, with equal training length and data.
 
 RESULTS.json holds the scores on held-out scenes, RESULTS.md the table. Rows that an earlier run measured with the same
 options are kept.
@@ -31,11 +31,11 @@ from stages.lab.training.state import TrainingState
 from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, validate
 
 METRICS = ("RMSE", "FPE", "R")
-VALIDATION_CHECKS = 6  # validations in one training; the best weights are scored
+VALIDATION_CHECKS = 6  # validations per training; the best weights are scored
 
 
 def run(data: Path, out: Path, options: AblationBenchOptions, only: str = "") -> Iterator[str]:
-    """Train each ablation, or those named in `only` (separated by commas); yield a line about each."""
+    """Train each ablation, or those named in `only` (comma-separated); yield a line for each."""
     names = chosen_names(only, ABLATIONS)
     base, device = _training(options), pick_device(options.device)
     asked = {k: v for k, v in asdict(options).items() if k != "device"}
@@ -52,7 +52,7 @@ def run(data: Path, out: Path, options: AblationBenchOptions, only: str = "") ->
 
 
 def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
-    """Train one ablation; its scores on the test groups."""
+    """Train one ablation and return its scores on the test groups."""
     options = choice.options(base)
     known, unseen = train_validation_split(
         read_groups(data, parse_groups(options.groups, more=EXTRA_GROUPS), options.keypoints), VALIDATION_SCENES
@@ -78,7 +78,7 @@ def _frames(scenes: KeypointMotions) -> int:
 
 
 def _before(out: Path, options: dict) -> dict | None:
-    """Results of an earlier run with the same options, if there are any."""
+    """Results of an earlier run with the same options, or None."""
     if not out.exists():
         return None
     try:
@@ -122,7 +122,7 @@ def _line(name: str, row: dict) -> str:
 
 
 def _training(options: AblationBenchOptions) -> TrainOptions:
-    """Options of the full network's training."""
+    """Training options of the full network."""
     chosen = asdict(options)
     del chosen["test"]
     return TrainOptions(**chosen, loss="axes", checks=VALIDATION_CHECKS)

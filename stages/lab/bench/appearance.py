@@ -1,11 +1,11 @@
-"""Benchmark of appearance: held-out photos, compared with gsplat's default recipe after the same wall time.
+"""Benchmark of appearance: held-out photos, compared with gsplat's default recipe for the same wall time.
 
-Both start from the same cameras and sparse points, train on the same undistorted photos at the same size, and are
-scored by the same code on held-out photos. Our background is the photos' mean colour; gsplat's is black or that colour,
-whichever scores better. Our time covers all that follows structure from motion: depth maps, initial Gaussians, and
-their optimisation. gsplat's schedule of 30,000 steps does not fit into it, so it is scaled to the number of steps that
-do: this number is estimated from the speed of the first 100 steps and, where a run then ends far from our time, once
-more from that run. Estimating it does not count as gsplat's time.
+Both methods start from the same cameras and sparse points, train on the same undistorted photos at the same size, and
+are scored by the same code on held-out photos. Our background is the mean colour of the photos; for gsplat it is black
+or that colour, whichever scores better. Our time covers everything after structure from motion: depth maps, initial
+Gaussians, and their optimisation. gsplat's schedule of 30,000 steps does not fit into this time, so it is scaled to the
+number of steps that do. This number is estimated from the speed of the first 100 steps and, if the run then ends far
+from our time, once more from that run. The estimation does not count as gsplat's time.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from stages.reconstruct.step_cache import StepCache, fingerprint
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 BLACK = (0.0, 0.0, 0.0)
-WARMUP_STEPS = 100  # steps that estimate gsplat's initial speed
-SPEED_FRACTION = 0.5  # mean speed / initial speed, as Gaussians multiply: first estimate
-MAX_TIME_RATIO = 1.15  # gsplat's time / ours: its first run is stopped here, and repeated if below the inverse
+WARMUP_STEPS = 100  # steps from which gsplat's initial speed is estimated
+SPEED_FRACTION = 0.5  # first estimate of mean speed / initial speed, which falls as the number of Gaussians grows
+MAX_TIME_RATIO = 1.15  # gsplat's time / ours at which its first run is stopped; below the inverse it is repeated
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class MethodScore:
     """Time, size and scores of one method."""
 
     seconds: float  # wall time
-    steps: int  # photometric, on one photo each
+    steps: int  # photometric steps of one photo each
     gaussians: int
     psnr: float  # mean over held-out photos [dB]
-    ssim: float
-    psnr_exposed: float  # the same with the exposure of each photo fitted [dB]
+    ssim: float  # mean over held-out photos
+    psnr_exposed: float  # as `psnr`, after fitting the exposure of each photo [dB]
 
     def __str__(self) -> str:
         shown = f"{self.psnr:6.2f} ({self.psnr_exposed:5.2f}) dB {self.ssim:.3f}"
@@ -62,7 +62,7 @@ class MethodScore:
 def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterator[str]:
     """Yield a line for each set; all results go to the JSON file `out`, which keeps rows of other sets.
 
-    Raises InputError without photo sets and without an NVIDIA GPU.
+    Raises InputError if there are no photo sets or no NVIDIA GPU.
     """
     if not sets:
         raise InputError("name one or more photo sets: a folder of photos, or one with images/")
@@ -84,12 +84,12 @@ def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterato
 def measure(
     name: str, images: Path, options: AppearanceBenchOptions, device: str = "cuda", draw: Callable | None = None
 ) -> dict:
-    """Both methods on one set; `draw` replaces gsplat.rasterization in tests."""
+    """Measure both methods on one set; `draw` replaces gsplat.rasterization in tests."""
     wanted = options.reconstruction()
     photos = read_photos(images, wanted.max_side)
     steps = camera_steps(name, photos, options.models)
     model = sfm.estimate_cameras(photos, steps=steps)
-    (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run; computing it is part of our time
+    (steps.folder / "depth.pt").unlink(missing_ok=True)  # left by an earlier run; computing it is part of our time
     made, seconds = timed(lambda: classic.reconstruct(photos, wanted, steps))
     count = wanted.iteration_count(len(made.trained), device)
     ours = judged(made.scene.gaussians, made, made.scene.background, seconds, count, device)
@@ -100,7 +100,7 @@ def measure(
 
 
 def camera_steps(name: str, photos: Photos, models: Path | None) -> StepCache:
-    """The cache of cameras in `models`. Photos of the same names and sizes are assumed to be the same."""
+    """The camera cache in `models`. Photos with the same names and sizes are assumed to be identical."""
     if models is None:
         return StepCache()
     models.mkdir(parents=True, exist_ok=True)
@@ -111,14 +111,14 @@ def camera_steps(name: str, photos: Photos, models: Path | None) -> StepCache:
 def gsplat_result(
     made: Reconstruction, model: sfm.SparseModel, seconds: float, device: str = "cuda", draw: Callable | None = None
 ) -> MethodScore:
-    """gsplat's recipe from the same points, in the frame of our scene, for about the same wall time."""
+    """Train gsplat's recipe from the same points, in the frame of our scene, for about the same wall time."""
     views, world = made.views[made.trained], made.scene.provenance["upright"]
     move = Similarity(world["scale"], torch.tensor(world["rotation"]), torch.tensor(world["translation"]))
 
     def train(steps: int, going: Callable[[int], bool]) -> tuple[Gaussians, int]:
         return peer.train(views, coloured_points(model, move, views, made.trained), steps, device, draw, going)
 
-    for _ in range(2):  # the first warms up
+    for _ in range(2):  # the first call is a warm-up
         _, first = timed(lambda: train(peer.FULL_STEPS, lambda done: done < WARMUP_STEPS))
     steps = max(1, int(SPEED_FRACTION * WARMUP_STEPS * seconds / first))
     for longest in (MAX_TIME_RATIO * seconds, math.inf):
@@ -134,7 +134,7 @@ def gsplat_result(
 
 
 def coloured_points(model: sfm.SparseModel, move: Similarity, views: Views, trained: list[int]) -> peer.ColouredPoints:
-    """Sparse points that training photos show, transformed, with the mean of their colours there (0..1)."""
+    """Sparse points visible in training photos, transformed, with their mean colours in these photos (0..1)."""
     points, total, count = move(model.points), torch.zeros(len(model.points), 3), torch.zeros(len(model.points))
     for row, view in enumerate(trained):
         index = model.point_index[model.view_index == view]
@@ -152,7 +152,7 @@ def judged(
     gaussians: Gaussians, made: Reconstruction, background: Sequence[float], seconds: float, steps: int,
     device: str = "cuda",
 ) -> MethodScore:  # fmt: skip
-    """Score Gaussians on the held-out photos, on a background colour."""
+    """Score Gaussians on the held-out photos over a background colour."""
     raw, fitted = (
         score_views(gaussians, made.views, made.held_out, device, exposed, background) for exposed in (False, True)
     )

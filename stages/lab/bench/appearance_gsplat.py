@@ -1,11 +1,11 @@
 """gsplat's default training recipe: that of its published simple_trainer without options.
 
 The loop is ours, with gsplat's rasteriser and DefaultStrategy inside. Gaussians start at the sparse points with opacity
-0.1 and the distance to their three nearest neighbours as scale; the SH degree grows every 1,000 steps, up to 3;
-Gaussians are densified every 100 steps from 500 to 15,000; the learning rate of the means falls to a hundredth over
-30,000 steps. A run of fewer steps scales all of these numbers alike, as the trainer's steps_scaler does. SSIM is our
-own implementation, as in our recipe. The strategy is unchanged: in 1.5.3 it never resets opacities, as `0 & step > 0`
-is false.
+0.1 and the distance to their three nearest neighbours as scale. The SH degree grows every 1,000 steps, up to 3.
+Gaussians are densified every 100 steps from 500 to 15,000. The learning rate of the means decays to a hundredth over
+30,000 steps. With fewer steps all of these numbers are scaled alike, as by the trainer's steps_scaler. SSIM is our own
+implementation, as in our recipe. The strategy is unchanged: 1.5.3 never resets opacities, since `0 & step > 0` is
+false.
 Source: Ye et al. 2025, "gsplat: an open-source library for Gaussian splatting", and its examples at version 1.5.
 """
 
@@ -28,16 +28,17 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench.common import import_gsplat
 from stages.reconstruct.photos import Views
 
-FULL_STEPS = 30_000  # steps of the published schedule, to which these belong:
+FULL_STEPS = 30_000  # length of the published schedule
+# parameters of DefaultStrategy for FULL_STEPS [steps]
 SCHEDULE = {"refine_start_iter": 500, "refine_stop_iter": 15_000, "reset_every": 3000, "refine_every": 100}
-DEGREE_EVERY = 1000
+DEGREE_EVERY = 1000  # steps between increases of the SH degree
 LEARNING_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 SEED = 0
-SSIM_WEIGHT = 0.2  # weight of 1 - SSIM against L1
+SSIM_WEIGHT = 0.2  # weight of 1 - SSIM in the loss; L1 has the rest
 
 
 class ColouredPoints(NamedTuple):
-    """Sparse points that training starts from."""
+    """Sparse points from which training starts."""
 
     points: Float[Tensor, "m 3"]
     colours: Float[Tensor, "m 3"]  # 0..1
@@ -51,12 +52,12 @@ def train(
     draw: Callable | None = None,
     going: Callable[[int], bool] = lambda done: True,
 ) -> tuple[Gaussians, int]:
-    """Train for `steps` of one photo each; the Gaussians and the number of steps done (fewer once `going` is false).
+    """Train for `steps` steps of one photo each; return the Gaussians and the number of steps done.
 
-    `draw` replaces gsplat.rasterization in tests.
+    Training stops early when `going(steps done)` is false. `draw` replaces gsplat.rasterization in tests.
     """
     gsplat = import_gsplat()
-    torch.manual_seed(SEED)  # the strategy draws from PyTorch's own generator
+    torch.manual_seed(SEED)  # the strategy uses PyTorch's global generator
     draw, scale = draw or gsplat.rasterization, steps / FULL_STEPS
     eyes = centres(views.cameras.viewmats)
     size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
@@ -96,7 +97,7 @@ def train(
 
 
 def initial_parameters(start: ColouredPoints, device: str) -> dict[str, torch.nn.Parameter]:
-    """Initial parameters, one for each learning rate."""
+    """Initial parameters, grouped by learning rate."""
     points, colours = start
     n = len(points)
     values = {

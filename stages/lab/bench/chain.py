@@ -1,7 +1,7 @@
-"""Benchmark of the chain from photos to a film: seconds of each stage, utilisation of the GPU, and repeatability.
+"""Benchmark of the pipeline from photos to a video: time of each stage, GPU utilisation, and repeatability.
 
-The stages run in one process, as often as asked, and then once as separate commands, which adds their start-up. The
-files of all runs are compared by their sha256.
+The stages run repeatedly in one process, and then once as separate commands, which adds their start-up time. The files
+of all runs are compared by sha256.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from stages.core.scene.scene_ply import read_scene
 from stages.lab.bench.common import machine, write_results
 from stages.lab.bench.speed_options import ChainBenchOptions
 
-PAPER_SECONDS = {"without refine": 12, "with refine": 37}  # photos to film on one GPU, as the paper states
-SAMPLE_SECONDS = 0.05  # between readings of the GPU's utilisation
+PAPER_SECONDS = {"without refine": 12, "with refine": 37}  # photos to video on one GPU, as stated in the paper
+SAMPLE_SECONDS = 0.05  # interval between readings of the GPU utilisation
 
 
 def command_lines(photos: Path, folder: Path, options: ChainBenchOptions) -> dict[str, list[str]]:
-    """Arguments of `ngff` for each stage, in order."""
+    """Command-line arguments of `ngff` for each stage, in order."""
     device, scene = ["--device", options.device], folder / "scene.ply"
     lines = {
         "reconstruct": [str(photos), "-o", str(scene), "--quality", options.quality, *device],
@@ -45,7 +45,7 @@ def command_lines(photos: Path, folder: Path, options: ChainBenchOptions) -> dic
 
 
 def stage_calls(photos: Path, folder: Path, options: ChainBenchOptions) -> dict[str, Callable[[], object]]:
-    """The same stages as functions."""
+    """The stages as Python calls, equivalent to `command_lines`."""
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.stage import run as reconstruct
     from stages.refine.options import RefineOptions
@@ -106,7 +106,7 @@ def _lines(title: str, row: dict[str, tuple[float, float | None]]) -> Iterator[s
 
 
 def timed(call: Callable[[], object], device: str) -> tuple[float, float | None]:
-    """Seconds of a call and the share of them in which the GPU was busy; None on a CPU."""
+    """Wall time of a call [s], and the fraction of it in which the GPU was busy (None on a CPU)."""
     with _busy_samples(device) as samples:
         start = time.perf_counter()
         call()
@@ -118,9 +118,10 @@ def timed(call: Callable[[], object], device: str) -> tuple[float, float | None]
 
 @contextmanager
 def _busy_samples(device: str) -> Iterator[list[int]]:
-    """Utilisation of the GPU [%], read in a thread; stays empty on a CPU and without NVIDIA's management library."""
+    """GPU utilisation [%], sampled in a thread; stays empty on a CPU and without NVIDIA's management library."""
     samples: list[int] = []
-    done, gpu = threading.Event(), None if device == "cpu" else torch.cuda.current_device()  # of this thread
+    # CUDA's current device is set per thread, so it is read here
+    done, gpu = threading.Event(), None if device == "cpu" else torch.cuda.current_device()
 
     def watch() -> None:
         while not done.wait(SAMPLE_SECONDS):
@@ -141,7 +142,7 @@ def _busy_samples(device: str) -> Iterator[list[int]]:
 
 
 def _command_seconds(line: list[str]) -> float:
-    """Seconds of one command in a process of its own. Raises InputError with its message if it fails."""
+    """Wall time of one command in a separate process [s]. Raises InputError with its message if it fails."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", "from ngff_cli import ngff; ngff()", *line],
                           capture_output=True, text=True)  # fmt: skip

@@ -1,7 +1,7 @@
-"""The paper's table of times: from photos to a film, with and without refinement, of 3 and of 6 objects.
+"""The paper's table of times: from photos to a video, with and without refinement, for 3 and 6 objects.
 
-Photos are rendered of toys in the air (stages/lab/track/stand_in.py), as many and of the size that the paper uses.
-Cameras and objects are found from the photos alone.
+Photos of toys in the air are rendered (stages/lab/track/stand_in.py), in the number and size that the paper uses.
+Cameras and objects are estimated from the photos alone.
 Source of the paper's figures: its table of end-to-end times, on one H100.
 """
 
@@ -19,11 +19,11 @@ from stages.lab.bench.speed_options import ChainBenchOptions, ChainTableOptions
 from stages.lab.track.stand_in import StandInOptions, write_photos
 
 STAGES = ("reconstruct", "segment", "refine", "simulate", "render")
-PAPER_SECONDS = {3: {True: 37, False: 12}, 6: {True: 72, False: 19}}  # by number of objects, with and without refine
+PAPER_SECONDS = {3: {True: 37, False: 12}, 6: {True: 72, False: 19}}  # by number of objects, and whether refine is run
 
 
 def run(out: Path | None, options: ChainTableOptions) -> Iterator[str]:
-    """Lines of a table in Markdown [s], and JSON with all runs in `out`."""
+    """Yield the lines of a Markdown table [s]; `out` receives all runs as JSON."""
     device, results = pick_device(options.device), []
     yield f"{machine(device)}; {options.photos} photos of {options.width} px, {options.steps} frames; seconds"
     yield ""
@@ -48,7 +48,7 @@ def run(out: Path | None, options: ChainTableOptions) -> Iterator[str]:
 
 
 def measure(photos: Path, folder: Path, device: str, options: ChainTableOptions) -> list[dict]:
-    """Seconds of each stage with and without refine; both share the scene and its objects."""
+    """Time of each stage with and without refine [s]; both share reconstruction and segmentation."""
     rows = []
     for refine in (True, False):
         chain = ChainBenchOptions(quality=options.quality, device=device, steps=options.steps, refine=refine)

@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: name of the machine, the peer gsplat, timing with the GPU's work, result files."""
+"""Helpers shared by the benchmarks: machine description, import of gsplat, timing of GPU work, result files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def machine(device: str) -> str:
 
 
 def import_gsplat() -> ModuleType:
-    """The package gsplat, which only benchmarks use; MissingPackage where it is absent."""
+    """The package gsplat, which only benchmarks use. Raises MissingPackage if it is not installed."""
     try:
         import gsplat
     except ImportError as error:
@@ -43,7 +43,7 @@ def _cpu() -> str:
 
 
 def median_seconds(function: Callable[[], object], device: str, repeat: int = 5) -> float:
-    """Median wall time of a call [s], the GPU's work included; call it once before to warm up."""
+    """Median wall time of a call including its GPU work [s]. The caller warms up."""
     times = []
     for _ in range(repeat):
         _wait(device)
@@ -68,7 +68,7 @@ def copy_bandwidth(device: str) -> float:
 
 
 def float32_rate(device: str) -> float:
-    """Operations per second of a matrix product in float32, without TF32."""
+    """Operations per second of a float32 matrix product, without TF32."""
     size = 8192 if device != "cpu" else 2048
     a, b = (torch.randn(size, size, device=device) for _ in range(2))
     allowed = torch.backends.cuda.matmul.allow_tf32
@@ -81,9 +81,9 @@ def float32_rate(device: str) -> float:
 
 
 def earlier_results(out: Path, key: str) -> dict:
-    """The results by name that an earlier run stored in `out` under `key`; none where there is no such file.
+    """The results by name that an earlier run stored in `out` under `key`; empty if the file does not exist.
 
-    Raises InputError where the file holds something else.
+    Raises InputError if the file has other content.
     """
     if not out.exists():
         return {}
@@ -95,13 +95,13 @@ def earlier_results(out: Path, key: str) -> dict:
 
 
 def write_json(out: Path, facts: Mapping) -> None:
-    """Write results as JSON, every list of plain values on one line."""
+    """Write results as JSON, with every list of plain values on one line."""
     text = re.sub(r"\[[^][{}]*\]", lambda found: json.dumps(json.loads(found[0])), json.dumps(facts, indent=1))
     with replacing(Path(out)) as part:
         part.write_text(text + "\n")
 
 
 def write_results(out: Path | None, name: str, device: str, facts: Mapping) -> None:
-    """Write the results of `ngff-lab bench NAME` with the machine they were measured on; nothing without `out`."""
+    """Write the results of `ngff-lab bench NAME` with the machine on which they were measured, if `out` is given."""
     if out is not None:
         write_json(out, {"command": f"ngff-lab bench {name}", "machine": machine(device), **facts})

@@ -1,8 +1,8 @@
 """Benchmark of object completion on scenes observed from one side only, compared with the true scenes.
 
-A few objects stand on a table; ten cameras look from the front, and only Gaussians that they see are kept, with noise.
-Each completer of `refine` is measured by the surfaces (Chamfer distance), views from behind (PSNR), and the motion of
-the objects when they are dropped (RMSE).
+A few objects stand on a table; ten cameras look from the front, and only the Gaussians visible to them are kept, with
+noise. Each completer of `refine` is evaluated by surface (Chamfer distance), views from behind (PSNR), and motion of
+the dropped objects (RMSE).
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
 OBJECT_SIZE = 0.3  # longest side of an object [m]
-IMAGE_SIZE, REAR_VIEWS = 320, 6  # pixels a side; novel views compared with the truth
-FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera [degrees]
-SURFACE_DEPTH = 0.03 * OBJECT_SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
+IMAGE_SIZE, REAR_VIEWS = 320, 6  # side of the images [px], and number of novel views compared with the truth
+FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera of each arc [degrees]
+SURFACE_DEPTH = 0.03 * OBJECT_SIZE  # depth behind the rendered surface up to which a Gaussian belongs to it [m]
 COMPLETERS = ("none", "close", "library")
 METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
 
 
 def true_scene(object_names: str, options: CompleteBenchOptions) -> Scene:
-    """The objects side by side, rotated at random about the vertical, on a grey table whose top is z = 0."""
+    """The objects side by side, rotated randomly about the vertical, on a grey table with its top at z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
     names = chosen_names(object_names, OBJECTS, "--scene")
     table = sheet(1.6, 1.6, 0.012)
     parts = [to_gaussians(table, torch.full((len(table.points), 3), 0.55), 0, 0.9)]
     for i, name in enumerate(names):
-        half = torch.pi * torch.rand(1, generator=rng)  # of the angle
+        half = torch.pi * torch.rand(1, generator=rng)  # half the rotation angle [rad]
         rotation = matrix(torch.cat([half.cos(), torch.zeros(2), half.sin()]))
         g = subsample(make_object(name), options.thin)
         low = float((OBJECT_SIZE * g.means[:, 2]).min())
@@ -67,7 +67,7 @@ def true_scene(object_names: str, options: CompleteBenchOptions) -> Scene:
 
 
 def subsample(g: Gaussians, step: int) -> Gaussians:
-    """Every n-th Gaussian, enlarged to cover the same area."""
+    """Every `step`-th Gaussian, enlarged to cover the same area."""
     few = g[torch.arange(0, len(g), step)]
     return replace(few, scales=few.scales * step**0.5)
 
@@ -80,7 +80,7 @@ def camera_arc(count: int, azimuth: float, elevation: float, sweep: float = 120.
 
 
 def visible_scene(scene: Scene, options: CompleteBenchOptions) -> Scene:
-    """The Gaussians of the objects that a camera sees, with noise, and the whole table."""
+    """The Gaussians of the objects that are visible in a camera, with noise, and the complete table."""
     g = scene.gaussians
     seen = g[visible(scene) | (g.object_id == 0)]
     error = (
@@ -107,14 +107,14 @@ def visible(scene: Scene) -> Bool[Tensor, "n"]:
 
 
 def chamfer_mm(scene: Scene, true: Scene) -> float:
-    """Chamfer distance between the objects of two scenes [mm], mean of both directions."""
+    """Chamfer distance between the objects of two scenes [mm], averaged over both directions."""
     a, b = (s.gaussians.means[s.gaussians.object_id > 0] for s in (scene, true))
     return 1000 * chamfer(nearest_neighbours(a, b), nearest_neighbours(b, a))["chamfer"]
 
 
 @torch.no_grad()
 def psnr_behind(scene: Scene, true: Scene) -> float:
-    """Mean PSNR of views from behind [dB], over the pixels that the true objects cover."""
+    """Mean PSNR of views from behind [dB], over the pixels covered by the true objects."""
     views, values = camera_arc(REAR_VIEWS, REAR_AZIMUTH, 20.0), []
     for viewmat, K in zip(views.viewmats, views.Ks, strict=True):
         mine, real = (rasterise(s.gaussians, viewmat[None], K[None], IMAGE_SIZE, IMAGE_SIZE).rgb for s in (scene, true))
@@ -125,7 +125,7 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
 
 
 def run(out: Path | None, options: CompleteBenchOptions) -> Iterator[str]:
-    """Yield a line for each scene and completer and the means over scenes; all figures go to `out` as JSON."""
+    """Yield a line for each scene and completer, and for the means over scenes; `out` receives the results as JSON."""
     yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
     scenes = {}
     with tempfile.TemporaryDirectory() as name:
@@ -172,7 +172,7 @@ def _library(folder: Path, options: CompleteBenchOptions) -> None:
 
 
 def _fall(scene: Scene, path: Path, options: CompleteBenchOptions) -> None:
-    """Simulate the objects dropped from a height; the trajectory is PATH.h5."""
+    """Simulate the objects dropped from a height; writes the trajectory to PATH.h5."""
     write_scene(path.with_suffix(".ply"), scene)
     chosen = SimulateOptions(
         steps=options.frames, engine="mpm", quality="draft", lift=(str(options.lift),), keypoints=256

@@ -5,9 +5,9 @@
     4, 6 objects       more objects than the 3 of most training scenes, 80 frames
     held-out objects   scenes of objects that no model was trained on (`ngff-lab heldout`), 80 frames
 
-Rows that need no training are compared with: free fall, the true scenes simulated again from starts moved by 1 mm (a
-bound by predictability), the best rigid fit to the truth, and MPM with materials estimated by a vision-language model.
-RESULTS.json holds all results; RESULTS.md and RESULTS.png are drawn from it.
+The baselines need no training: free fall, the true scenes simulated again from starts moved by 1 mm (a bound set by
+predictability), the best rigid fit to the truth, and MPM with materials estimated by a vision-language model.
+RESULTS.json holds all results; RESULTS.md and RESULTS.png are made from it.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from stages.lab.training.history import total_minutes
 log = logging.getLogger(__name__)
 SPLITS = {**sensitivity.SPLITS, "held-out objects": (("heldout",), 80)}
 TIMED_STEPS = 100  # steps of the timed rollout
-STRIDE = 8  # frames between the values of an object's error curve
-COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # results in one table must agree in these
+STRIDE = 8  # frames between the values of the error curve of an object
+COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # results in one table must agree in these values
 METRICS = ("MSE", "RMSE", "FPE", "PCE", "R", "R_pooled")
 FREE_FALL, NUDGED, RIGID_FIT, MPM_ESTIMATED = (
     "no learning",
@@ -62,9 +62,9 @@ NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *HELDOUT_SHAPES.item
 
 
 def redraw(results: Path) -> list[str]:
-    """Write table and plots again from the results of an earlier run; the lines of the table.
+    """Write table and plots again from the results of an earlier run; return the lines of the table.
 
-    Raises InputError for a file that holds no such results.
+    Raises InputError if the file has no such results.
     """
     must_exist(results, "results of `ngff-lab bench dynamics` (.json)")
     try:
@@ -82,7 +82,7 @@ def run(
     options: DynamicsBenchOptions,
     nudged: Path | None = None,
 ) -> list[str]:
-    """Measure every NAME.safetensors of a folder, and the rows without training, on every split of a data set.
+    """Evaluate every NAME.safetensors of a folder, and the untrained baselines, on every split of a data set.
 
     `nudged` is a second data set of the same scenes, with every start moved by 1 mm. Writes OUT.json, OUT.md
     and OUT.png; returns the lines of the table. Other rows of an earlier OUT.json are kept if it was measured on the
@@ -95,7 +95,7 @@ def run(
     device = pick_device(options.device)
     splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _groups_exist(data, name)}
     if not splits:
-        split_scenes(data, "spatial", options)  # raises InputError with what is missing
+        split_scenes(data, "spatial", options)  # raises InputError that names the missing files
     rows = {
         FREE_FALL: {
             "splits": {name: evaluate_predictor(predict_free_fall, m, options.batch) for name, m in splits.items()}
@@ -126,7 +126,7 @@ def run(
 
 
 def _earlier(out: Path) -> dict:
-    """Results of an earlier run, if there are any."""
+    """Results of an earlier run; empty if there is none."""
     if not out.is_file():
         return {}
     try:
@@ -137,7 +137,7 @@ def _earlier(out: Path) -> dict:
 
 
 def _groups_exist(data: Path, split: str) -> bool:
-    """Whether all groups of a split exist; logs a warning for a split that is left out."""
+    """Whether all groups of a split exist; logs a warning if not."""
     missing = [g for g in SPLITS[split][0] if not (motions_folder(data) / f"{g}.h5").is_file()]
     if missing:
         log.warning("%s is not measured: %s has no %s", split, data, ", ".join(missing))
@@ -145,7 +145,7 @@ def _groups_exist(data: Path, split: str) -> bool:
 
 
 def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> KeypointMotions:
-    """The scenes of a split, with as many frames as it has."""
+    """The scenes of a split, truncated to its number of frames."""
     groups, frames = SPLITS[split]
     motions = read_groups(data, groups, options.keypoints)
     count = min(len(motions), options.limit or len(motions))
@@ -160,7 +160,7 @@ def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Keypo
 def _nudged_metrics(
     nudged: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions
 ) -> Iterator[tuple[str, dict]]:
-    """Metrics of the nudged scenes against the true ones, split by split."""
+    """Metrics of the scenes with moved starts relative to the true ones, by split."""
     for split, motions in splits.items():
         if _groups_exist(nudged, split):
             made = read_groups(nudged, SPLITS[split][0], options.keypoints)
@@ -168,7 +168,7 @@ def _nudged_metrics(
 
 
 def _compared(made: KeypointMotions, motions: KeypointMotions, batch: int) -> dict:
-    """Metrics of scenes simulated differently; those that failed are counted and left out."""
+    """Metrics of scenes from another simulation; scenes that failed in it are counted and left out."""
     both = shared_scenes(motions, made)
     if not len(both):
         raise InputError("the two data sets have no scene in common by name")
@@ -177,7 +177,7 @@ def _compared(made: KeypointMotions, motions: KeypointMotions, batch: int) -> di
 
 
 def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
-    """MPM with estimated materials, on splits whose objects all have an estimate in the paper."""
+    """Metrics of MPM with estimated materials, on splits for whose objects the paper has estimates."""
     row: dict = {"splits": {}}
     for split, motions in splits.items():
         if not set(motions.objects.unique().tolist()) - {-1} <= {kind.id for kind in OBJECTS.values()}:
@@ -193,7 +193,7 @@ def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchO
 
 def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
     model, card = checkpoints.load(file, device)
-    learned = card.get("options", {}).get("keypoints", options.keypoints)  # it was not trained with more
+    learned = card.get("options", {}).get("keypoints", options.keypoints)  # use no more keypoints than in training
     splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
     with torch.inference_mode():
         results = {n: evaluate_predictor(_rolled(model), m, options.batch) for n, m in splits.items()}
@@ -212,7 +212,7 @@ def _rolled(model: Dynamics) -> Predict:
 
 
 def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
-    """Wall time of a rollout of TIMED_STEPS steps of one scene [s], without recording its graph."""
+    """Wall time of a rollout of TIMED_STEPS steps of one scene [s], without recording its CUDA graph."""
     one = motions[:1].initial_conditions()
     stepper = TimeStepper(model, one, motions.dt)
 
@@ -225,9 +225,9 @@ def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
 
 
 def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -> dict:
-    """Metrics averaged over the scenes; error [m] by frame, for all objects and for each kind of object.
+    """Metrics averaged over the scenes, and error [m] by frame, for all objects and for each kind of object.
 
-    A rollout that is not finite counts with R = 0 and makes the RMSE undefined.
+    A rollout that is not finite counts as R = 0 and makes the RMSE undefined.
     """
     metrics, errors = [], []
     for first in tqdm(range(0, len(motions), batch), unit="batch", leave=False):

@@ -1,4 +1,4 @@
-"""Baselines of the dynamics benchmark without training: free fall, rigid fit, other simulations, MPM.
+"""Untrained baselines of the dynamics benchmark: free fall, rigid fit, other simulations, MPM.
 
 Each is a function from scenes to keypoints in all of their frames (`Predict`).
 """
@@ -27,7 +27,7 @@ from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
 Predict = Callable[[KeypointMotions], Float[Tensor, "s t o n 3"]]
-# E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
+# E [Pa] and density [kg/m^3] of the GSCollision objects as estimated by the paper's vision-language model
 VLM_MATERIALS = {
     "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
     "duck": (4828.29, 1100.0), "miku": (2114.27, 150.0), "panda": (2114.27, 150.0), "phone": (2e7, 2700.0),
@@ -41,7 +41,7 @@ def predict_free_fall(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
 
 
 def free_fall(world: InitialConditions, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
-    """Objects fall without rotation until their lowest keypoint is on the floor, and stay there."""
+    """Objects fall without rotation until their lowest keypoint reaches the floor, and stay there."""
     time = dt * torch.arange(frames, dtype=world.points.dtype, device=world.points.device)
     fallen = -world.gravity[:, None, None, 2] * time[:, None].square() / 2
     height = world.points[..., 2].masked_fill(~world.valid, torch.inf).amin(2) - world.floor
@@ -52,9 +52,9 @@ def free_fall(world: InitialConditions, frames: int, dt: float) -> Float[Tensor,
 
 
 def predict_rigid_fit(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
-    """The true motion with each object replaced by its rest shape in the pose that fits best, frame by frame.
+    """The true motion with each object replaced by its rest shape in the best-fitting pose, frame by frame.
 
-    A lower bound on the error of rigid-body models.
+    Its error is a lower bound on the error of rigid-body models.
     """
     return rigid_fit(some.points, some.present[..., None].expand(some.points[:, 0, ..., 0].shape))
 
@@ -70,9 +70,9 @@ def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) 
 
 
 def predict_from(made: KeypointMotions, frames: int) -> Predict:
-    """A predictor that looks up other motions of the same scenes by name.
+    """A predictor that looks up another simulation of the same scenes by name.
 
-    It raises InputError for motions with fewer frames, objects or keypoints.
+    It raises InputError if that simulation has fewer frames, objects or keypoints.
     """
     row = {name: i for i, name in enumerate(made.names)}
 
@@ -92,13 +92,13 @@ def shared_scenes(motions: KeypointMotions, made: KeypointMotions) -> KeypointMo
 
 
 def with_estimated_materials(objects: Mapping[int, Asset]) -> dict[int, Asset]:
-    """The objects with the Young's moduli and densities that the paper's vision-language model estimated."""
+    """The objects with Young's moduli and densities as estimated by the paper's vision-language model."""
     names = {kind.id: name for name, kind in OBJECTS.items()}
     return {i: replace(a, E=VLM_MATERIALS[names[i]][0], density=VLM_MATERIALS[names[i]][1]) for i, a in objects.items()}
 
 
 class Resimulation:
-    """Scenes of a data set simulated again with estimated materials and otherwise equal settings."""
+    """Simulates scenes of a data set again with estimated materials and otherwise equal settings."""
 
     def __init__(self, data: Path, groups: list[str], device: str):
         self.device, self.configs = device, {}
@@ -118,11 +118,11 @@ class Resimulation:
         self.discretisation = replace(given, substep=substep)
 
     def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> KeypointMotions:
-        """Simulate scenes by name; failed ones are missing from the result."""
+        """Simulate scenes by name; scenes that fail are missing from the result."""
         return concatenate_motions(list(self._parts({name: self._config(name) for name in names}, frames, keypoints)))
 
     def seconds(self, name: str, steps: int) -> float:
-        """Wall time of one scene alone [s], solver set-up included, after compilation."""
+        """Wall time of a single scene [s], including solver set-up but not compilation."""
         one = {name: self._config(name)}
         list(self._parts(one, 3, 1))
         return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)

@@ -9,7 +9,7 @@ from stages.core.scene.files import replacing
 from stages.lab.plot import Panel, draw_panels
 
 # NGFF paper (ICLR 2026), Table 1 and ablation, on its own data: RMSE, FPE, R by split, and seconds for 100 steps on an
-# H100; for the first three models only the mean over 4 and 6 objects is published, which is shown in both columns
+# H100. For the first three models only the mean over 4 and 6 objects is published, which is shown in both columns.
 PUBLISHED: Mapping[str, dict] = {
     "VLM-MPM": {"spatial": [0.306, 0.774, 0.299], "temporal": [0.328, 0.901, 0.3], "4 objects": [0.358, 0.904, 0.305],
                 "6 objects": [0.358, 0.904, 0.305], "seconds": 39.29},
@@ -23,7 +23,7 @@ PUBLISHED: Mapping[str, dict] = {
              "6 objects": [0.1127, 0.446, 0.547], "seconds": 0.363},
 }  # fmt: skip
 PUBLISHED_NOTE = "as published, measured on other data (H100):"
-PLOT_COLUMNS = 5  # of plots
+PLOT_COLUMNS = 5  # plots per row
 Cells = list[str]
 
 
@@ -79,7 +79,7 @@ def _time(seconds: float | None) -> str:
 
 
 def markdown(stem: str, facts: dict) -> Iterator[str]:
-    """The results as a Markdown page; of the trained models the best value of each metric and split is bold."""
+    """The results as a Markdown page; the best value among the trained models is bold, by metric and split."""
     scenes = ", ".join(f"{count} {split} ({facts['frames'][split]} frames)" for split, count in facts["scenes"].items())
     run = f"{facts['machine']}, {facts['date']}"
     yield "# Dynamics"
@@ -135,7 +135,7 @@ def _bold(split: str, result: dict | None, best: dict[tuple[str, str], float]) -
 
 
 def panels(facts: dict) -> list[Panel]:
-    """Error over time [cm]: a panel for each split, then one for each object of the first split."""
+    """Plots of the error over time [cm]: one for each split, then one for each object of the first split."""
     splits, rows = list(facts["scenes"]), facts["rows"]
     out = []
     for split in splits:
@@ -153,7 +153,7 @@ def panels(facts: dict) -> list[Panel]:
 
 
 def _curve(values: list[float | None], stride: int) -> list[tuple[float, float]]:
-    """(frame, error [cm]) up to the first value that is not finite, at most 100 cm."""
+    """Points (frame, error [cm]) up to the first non-finite value, clamped to 100 cm."""
     points = []
     for i, value in enumerate(values):
         if value is None:

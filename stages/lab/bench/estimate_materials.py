@@ -1,7 +1,7 @@
-"""Materials of the objects in a video, estimated by a vision-language model: those of the VLM-MPM baseline.
+"""Materials of the objects in a video, estimated by a vision-language model, for the VLM-MPM baseline.
 
-As in the NGFF paper, the model gets frames of a video and replies with a Young's modulus and a density for each object,
-with which MPM simulates. The prompt is our own.
+As in the NGFF paper, the model receives frames of a video and replies with a Young's modulus and a density for each
+object, which MPM then uses. The prompt is our own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stages.core.scene.schema import quote
 from stages.lab.bench.motion_options import EstimateOptions
 
 log = logging.getLogger(__name__)
-RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
+RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # accepted values, from foams and gels to metals [Pa] [kg/m^3]
 UNITS = {"E": "Pa", "density": "kg/m^3"}
 PROMPT = """\
 These {frames} frames, evenly spaced in time, are from one video of objects that fall, collide and deform. {which}
@@ -39,9 +39,9 @@ Answer with nothing but one JSON object, one entry for each object, for example
 
 
 def run(video: Path, out: Path, options: EstimateOptions) -> list[str]:
-    """Write OUT for `ngff simulate --materials OUT`, and its provenance to OUT.json; a line about each object.
+    """Write OUT for `ngff simulate --materials OUT`, and its provenance to OUT.json; return a line for each object.
 
-    Raises InputError for an unreadable video, an endpoint that fails, and replies that cannot be used.
+    Raises InputError for an unreadable video, a failing endpoint, and unusable replies.
     """
     video, out = Path(video), Path(out)
     check_json_output(out)
@@ -61,7 +61,7 @@ def run(video: Path, out: Path, options: EstimateOptions) -> list[str]:
 
 
 def object_names(objects: str) -> list[str]:
-    """Names of the objects to ask about; empty when the model is to name them. Raises InputError for repeated names."""
+    """Names of the objects to ask about; empty if the model is to name them. Raises InputError for repeated names."""
     if objects.lower().endswith(".ply"):
         names = [o.name for o in read_scene(Path(objects)).objects]
         if not names:
@@ -77,7 +77,7 @@ def object_names(objects: str) -> list[str]:
 def estimate(
     endpoint: ChatEndpoint, jpegs: list[bytes], names: list[str], tries: int
 ) -> tuple[dict[str, dict], list[str]]:
-    """The estimate for each object, and all replies; an invalid reply is sent back with the reason."""
+    """The estimate for each object, and all replies. Invalid replies are sent back with the reason."""
     which = f"The objects are called: {', '.join(names)}." if names else "Give every object a short name of its own."
     text = PROMPT.format(frames=len(jpegs), which=which, example=names[0] if names else "duck", **RANGES)
     messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(image_part, jpegs)]}]
@@ -89,7 +89,7 @@ def estimate(
 
 
 def parse_reply(reply: str, names: list[str]) -> dict[str, dict]:
-    """A reply as {name: {material, E, density}}, in the order of the names. Raises InvalidReply for anything else."""
+    """Parse a reply into {name: {material, E, density}}, in the order of the names. Raises InvalidReply if invalid."""
     data = json_object(reply)
     if not data:
         raise InvalidReply("it must have an entry for each object")

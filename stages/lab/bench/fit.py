@@ -1,4 +1,4 @@
-"""Benchmark of `ngff-lab fit`: synthetic scenes whose materials are known, and the prediction of another motion."""
+"""Benchmark of `ngff-lab fit` on synthetic scenes with known materials, including the prediction of another motion."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from stages.lab.fit.problem import pose_problem
 from stages.lab.names import chosen_names
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
-KEYPOINTS, STEPS = 32, 50
-REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # largest error of identifiable parameters
+KEYPOINTS, STEPS = 32, 50  # per object, and per motion
+REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # target accuracy of identifiable parameters
 
 
 @dataclass(frozen=True)
 class FitCase:
-    """Objects with their true materials, the motion that is seen, and another one that is predicted."""
+    """Objects with their true materials, the observed motion, and another motion to be predicted."""
 
     name: str
     engine: str
@@ -45,7 +45,7 @@ class FitCase:
 
 
 def fit_case(index: int, kind: str, seed: int) -> FitCase:
-    """A random scene of a kind: two things that slide, fall or collide, or a soft one that falls."""
+    """A random scene of a kind: two objects that slide, fall or collide, or a soft one that falls."""
     rng = random.Random(f"{seed} {index}")
     materials = {i: Material(10 ** rng.uniform(5.3, 6.7) if kind == "soft" else 1e7, 10 ** rng.uniform(2.4, 3.1),
                              friction=rng.uniform(0.1, 0.7), loss=rng.uniform(0.05, 0.5)) for i in (1, 2)}  # fmt: skip
@@ -99,7 +99,7 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
 
 
 def _motion(scene, keypoints: Keypoints, prompts: ForcePrompts, materials: dict[int, Material], options):
-    """Keypoints as an engine moves them."""
+    """Keypoint positions simulated by an engine."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "materials.json"
         file.write_text(json.dumps({str(i): as_json(m) for i, m in materials.items()}))
@@ -108,10 +108,10 @@ def _motion(scene, keypoints: Keypoints, prompts: ForcePrompts, materials: dict[
 
 
 def errors_of(fit: Fit, case: FitCase) -> list[dict]:
-    """Each material constant that was searched: its error, half width, and whether it is identifiable.
+    """Error, half width and identifiability of each fitted material constant.
 
-    Densities and stiffness are compared as ratios to the density of the first object, which stays as it is: a motion
-    does not tell a common factor.
+    Density and stiffness are compared as ratios to the density of the first object, which is not fitted: the motion
+    does not depend on a common factor.
     """
     ratio = fit.problem.materials[1].density / case.materials[1].density
     rows = []
@@ -126,7 +126,7 @@ def errors_of(fit: Fit, case: FitCase) -> list[dict]:
 
 
 def run(out: Path | None, options: FitBenchOptions) -> Iterator[str]:
-    """Lines of a table of all scenes, and JSON in `out`."""
+    """Yield the lines of a table of all scenes; `out` receives the results as JSON."""
     device, results = pick_device(options.device), {}
     kinds = chosen_names(options.only, FIT_KINDS)
     yield f"{'scene':<14} identifiable: error +- half width of its interval"

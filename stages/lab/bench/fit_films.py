@@ -1,6 +1,6 @@
-"""Benchmark of `ngff-lab fit` on films that `ngff render` writes of a toy of known material and motion.
+"""Benchmark of `ngff-lab fit` on films rendered by `ngff render` of a toy with known material and motion.
 
-What the films tell is compared with what a fit of the motion alone tells, as it was followed through them.
+The fit to the films is compared with a fit to the track alone.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from stages.render.stage import run as render
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
-BLOCK = 2  # id in `falling_toys`
-AWAY_FROM = (0.16, 0.05, 0.0)  # from its place there to near the middle of the table [m]
+BLOCK = 2  # object id of the block in `falling_toys`
+AWAY_FROM = (0.16, 0.05, 0.0)  # displacement from there to near the middle of the table [m]
 
 
 @dataclass(frozen=True)
 class FilmedToy:
-    """A toy block on a table, and how it truly moves."""
+    """A toy block on a table, with its true material and motion."""
 
     scene: Scene
     material: Material
@@ -50,7 +50,7 @@ class FilmedToy:
 
 
 def filmed_toy(kind: str, cameras: int, width: int, seed: int) -> FilmedToy:
-    """A block that slides over the table, or one that is thrown onto it, in random directions."""
+    """A block that slides over the table or is thrown onto it, in a random direction."""
     rng, toys = random.Random(f"{kind} {seed}"), falling_toys().gaussians
     block = thinned(toys[toys.object_id == BLOCK])
     height = rng.uniform(0.06, 0.15) if kind == "throw" else 0.0
@@ -66,7 +66,7 @@ def filmed_toy(kind: str, cameras: int, width: int, seed: int) -> FilmedToy:
 
 
 def film(toy: FilmedToy, frames: int, folder: Path) -> tuple[Path, list[Path]]:
-    """Write the scene of a toy, and a film of each of its cameras by `ngff render`, into a folder."""
+    """Write the scene of a toy, and a film from each of its cameras by `ngff render`, into a folder."""
     scene, materials, motion = folder / "scene.ply", folder / "truth.json", folder / "motion.h5"
     write_scene(scene, toy.scene)
     materials.write_text(json.dumps({"1": as_json(toy.material)}))
@@ -74,7 +74,7 @@ def film(toy: FilmedToy, frames: int, folder: Path) -> tuple[Path, list[Path]]:
     simulate(scene, motion, SimulateOptions(engine="rigid", materials=materials, steps=frames, device="cpu",
                                             velocity=(f"object=1 {velocity}",)))  # fmt: skip
     films = [folder / name for name in toy.scene.cameras.names]
-    with redirect_stdout(sys.stderr):  # results go to the former
+    with redirect_stdout(sys.stderr):  # stdout is for results
         for i, path in enumerate(films):
             size = int(toy.scene.cameras.sizes[i].max())
             render(motion, path, RenderOptions(view=f"input:{i}", resolution=size, device="cpu"))
@@ -82,7 +82,7 @@ def film(toy: FilmedToy, frames: int, folder: Path) -> tuple[Path, list[Path]]:
 
 
 def measure(kind: str, options: FilmBenchOptions, seed: int) -> dict:
-    """Errors of the parameters, from the films and from the motion that was followed through them alone."""
+    """Errors of the parameters fitted to the films, and of those fitted to the track alone."""
     toy = filmed_toy(kind, options.films, options.width, seed)
     with tempfile.TemporaryDirectory() as folder:
         scene, films = film(toy, options.frames, Path(folder))
@@ -94,7 +94,7 @@ def measure(kind: str, options: FilmBenchOptions, seed: int) -> dict:
 
 
 def errors(fit: Fit, toy: FilmedToy) -> list[dict]:
-    """Of each parameter: its error, half width, and whether it is identifiable."""
+    """Error, half width and identifiability of each parameter."""
     true = {"friction": toy.material.friction, "loss": toy.material.loss, **dict(zip(AXES, toy.velocity, strict=True))}
     return [{"quantity": p.name, "true": true[p.name], "error": fit.value(k) - true[p.name],
              "half_width": fit.half_width(k), "identifiable": fit.is_identifiable(k)}
@@ -102,7 +102,7 @@ def errors(fit: Fit, toy: FilmedToy) -> list[dict]:
 
 
 def run(out: Path | None, options: FilmBenchOptions) -> Iterator[str]:
-    """Lines of a table of all scenes, and JSON in `out`."""
+    """Yield the lines of a table of all scenes; `out` receives the results as JSON."""
     device, results = pick_device(options.device), {}
     kinds = chosen_names(options.only, FILM_KINDS)
     for seed in range(options.seed, options.seed + options.scenes):

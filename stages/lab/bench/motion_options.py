@@ -15,7 +15,7 @@ FILM_KINDS = ("slide", "throw")
 
 @dataclass(frozen=True)
 class PhysicsBenchOptions:
-    """What is measured, with which engines."""
+    """Which experiments are run, with which engines."""
 
     only: str = option("", "experiments by group or pattern, such as slide,'boxes/0.3m*'; default: all")
     engines: tuple[str, ...] = option(("rigid", "mpm", "ngff"), "auto | rigid | mpm | ngff; repeatable", "--engine")
@@ -29,7 +29,7 @@ class PhysicsBenchOptions:
         unknown = [name for name in self.engines if name not in (AUTO, *ENGINES)]
         if unknown:
             raise InputError(f"--engine {unknown[0]}: choose from {', '.join((AUTO, *ENGINES))}")
-        SimulateOptions(contact=self.contact)  # raises for another
+        SimulateOptions(contact=self.contact)  # raises InputError for invalid values
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class DynamicsBenchOptions:
     keypoints: int = option(256, "keypoints per object")
     limit: int = option(0, "scenes of each split; 0: all")
     mpm: int = option(100, "scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
-    batch: int = 100  # scenes at once
-    seed: int = 0  # of the temporal sample
+    batch: int = 100  # scenes evaluated together
+    seed: int = 0  # selects the scenes of the temporal split
     device: str = device_option()
 
     def __post_init__(self):
@@ -65,7 +65,7 @@ class AblationBenchOptions:
 
 @dataclass(frozen=True)
 class TrackBenchOptions:
-    """Which stand-ins are filmed and tracked."""
+    """Number and quality of the synthetic sequences that are tracked."""
 
     sequences: int = option(5, "number of sequences")
     first: int = option(0, "seed of the first sequence", min=0)
@@ -143,6 +143,6 @@ class EstimateOptions:
     objects: str = option("", "names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
     model: str = option("", "name of a model that accepts images; default: $OPENAI_MODEL")
     timeout: float = option(120.0, "maximum waiting time for a reply [s]")
-    frames: int = 10  # evenly spaced
+    frames: int = 10  # number of frames shown, evenly spaced
     longest: int = 512  # longest side of a frame as sent [px]
-    tries: int = 3  # replies, before giving up
+    tries: int = 3  # maximum number of replies

@@ -1,7 +1,7 @@
 """Benchmark of the MPM solver, compared with an unfused three-kernel form in the same run and with memory bandwidth.
 
-Three elastic bodies a scene, eight particles a cell, falling on each other and on the floor; substep 1e-4 s, 200 a
-frame. A scene of the published data set is 100 such frames.
+A scene has three elastic bodies with eight particles per cell, which fall onto each other and onto the floor; a frame
+has 200 substeps of 1e-4 s. A scene of the published data set has 100 such frames.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from stages.lab.bench import mpm_three_kernel
 from stages.lab.bench.speed_options import MpmBenchOptions
 
 log = logging.getLogger(__name__)
-SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # as published
+SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # substep [s], substeps per frame, frames per scene, as published
 BODIES_PER_SCENE = 3
 PARTICLE_BYTES = 145  # read and written per particle and substep, without the grid
-STENCIL_NODES = 27  # of a particle's stencil: 16 bytes read and 16 bytes added each
+STENCIL_NODES = 27  # grid nodes in the stencil of a particle: 16 bytes read and 16 bytes added for each
 MATERIALS = ((8e5, 600.0), (1e5, 700.0), (3e5, 300.0))  # E [Pa], density [kg/m^3]: ball, panda, duck
 
 
 def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
-    """Three boxes above each other at the floor of the published domain; the domain; the grid spacing [m]."""
+    """Three boxes above each other near the floor of the published domain; also the domain, and grid spacing [m]."""
     side = round((particles / BODIES_PER_SCENE) ** (1 / 3))
     layers = max(1, round(particles / BODIES_PER_SCENE / side**2))
     h = 0.45 / side
@@ -42,9 +42,9 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
 
 
 def measure(particles: int, scenes: int, device: str, frames: int, schedule: str = "auto") -> dict:
-    """Time per substep of a batch and figures derived from it; `schedule` of the solver.
+    """Time per substep of a batch and figures derived from it, with a `schedule` of the solver.
 
-    With `contact` the bodies of a single scene have a velocity field each; its bytes leave out the pass over the grid.
+    With `contact`, each body of a single scene has its own velocity field; the bytes exclude the pass over the grid.
     """
     one, box, dx = falling_boxes(particles)
     if schedule == "contact" and scenes > 1:
@@ -86,7 +86,7 @@ def measure_three_kernel(particles: int, device: str) -> float:
 
 
 def batch_size(particles: int, device: str) -> int:
-    """Scenes that fill a GPU within its memory and the index range of exact sums; 1 on a CPU."""
+    """Number of scenes that fill a GPU within its memory and the index range of exact sums; 1 on a CPU."""
     if device == "cpu":
         return 1
     _, box, dx = falling_boxes(particles)
@@ -111,7 +111,7 @@ def run(out: Path | None, options: MpmBenchOptions) -> Iterator[str]:
         cases = [(1, "auto"), (1, "contact"), (many, "auto"), (many, "exact")]
         for scenes, schedule in dict.fromkeys(cases):
             r = measure(particles, scenes, device, options.frames, schedule)
-            speedup = plain * scenes / r["substep_us"] * 1e6  # compared with the three-kernel form
+            speedup = plain * scenes / r["substep_us"] * 1e6  # relative to the three-kernel form
             rows.append({"schedule": schedule, **r, "speedup": speedup})
             kind, shape = "mpm" if schedule == "auto" else f"mpm {schedule}", " x ".join(map(str, r["nodes"]))
             yield (

@@ -1,7 +1,8 @@
-"""Baseline of the MPM benchmark: the unfused form that most GPU solvers have.
+"""Baseline of the MPM benchmark: the unfused form of most GPU solvers.
 
-Three kernels per substep (particles to grid with scalar atomics, update of every grid node, grid to particles) after
-clearing the whole grid; particles are sorted by cell at the start. It is captured in a CUDA graph, as our solver is.
+Each substep clears the whole grid and runs three kernels: particles to grid with scalar atomics, update of every grid
+node, grid to particles. Particles are sorted by cell at the start. The substep is captured in a CUDA graph, like our
+solver.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def _to_particles(grid: MpmGrid, rows: ParticleArrays, dt: float, nodes: wp.arra
 
 
 def substep(solver: Solver, nodes, dt: float) -> None:
-    """One substep of a solver's elastic particles on `nodes`, a tensor of four floats per grid node."""
+    """Advance the elastic particles of a solver by one substep; `nodes` is a tensor of four floats per grid node."""
     rows, grid, device = solver.rows, solver.grid, solver.device
     nodes.zero_()
     launch(_to_grid, len(rows), [grid, rows.struct, dt, view(nodes)], device=device)

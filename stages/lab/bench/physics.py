@@ -1,4 +1,4 @@
-"""Benchmark of the engines against textbook physics, through the path that `ngff simulate` takes."""
+"""Benchmark of the engines against textbook physics, run through the stage `simulate`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.stage import run as simulate
 
-FAILED = "failed"  # in place of a value, where the engine ended with an error
+FAILED = "failed"  # stored in place of a value if the engine raised an error
 
 
 def chosen(only: str) -> list[Experiment]:
-    """The experiments that --only lists, or all. Raises InputError where a pattern fits none."""
+    """The experiments selected by --only, or all. Raises InputError if a pattern matches none."""
     table, patterns = experiments(), [pattern.strip() for pattern in only.split(",") if pattern.strip()]
     for pattern in patterns:
         if not any(_fits(name, pattern) for name in table):
@@ -44,9 +44,9 @@ def _fits(name: str, pattern: str) -> bool:
 
 
 def measure(experiment: Experiment, engine: str, options: PhysicsBenchOptions) -> dict:
-    """What is measured with one engine, whether it agrees with theory, and the seconds of all runs.
+    """Value measured with one engine, whether it agrees with theory, and the wall time of all runs [s].
 
-    With `auto` also the engines that it took; the tolerances are those of `rigid`, the narrowest.
+    For `auto` also the engines that were chosen; its tolerances are those of `rigid`, the narrowest.
     """
     start = time.perf_counter()
     try:
@@ -76,7 +76,7 @@ def trajectory(run: Run, engine: str, options: PhysicsBenchOptions) -> Trajector
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the messages of the stage: a bench repeats them a hundred times."""
+    """Suppress the messages of the stage, which would be repeated for every run."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -86,14 +86,14 @@ def _quiet() -> Iterator[None]:
 
 
 def run(out: Path, options: PhysicsBenchOptions) -> Iterator[str]:
-    """Yield a line for each experiment and engine; rows that `out` has already are kept and not measured again.
+    """Yield a line for each experiment and engine; rows already in `out` are kept and not measured again.
 
-    Also writes the table beside it as Markdown. Raises InputError where `out` has rows of another quality.
+    Also writes the table as Markdown next to `out`. Raises InputError if `out` has rows of another quality or contact.
     """
     table, device = experiments(), pick_device(options.device)
     facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}, "quality": options.quality,
                                     "contact": options.contact}  # fmt: skip
-    for name, default in (("quality", None), ("contact", "learned")):  # of tables from before
+    for name, default in (("quality", None), ("contact", "learned")):  # defaults for tables of older versions
         if (before := facts.get(name, default)) != getattr(options, name):
             raise InputError(f"{out}: has rows measured at --{name} {before}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}
@@ -114,7 +114,7 @@ def run(out: Path, options: PhysicsBenchOptions) -> Iterator[str]:
 
 
 def _before(out: Path) -> dict | None:
-    """Results of an earlier run."""
+    """Results of an earlier run, or None."""
     if not out.exists():
         return None
     try:
@@ -137,7 +137,7 @@ def _number(value: float | str) -> str:
 
 
 def markdown(facts: Mapping) -> Iterator[str]:
-    """The results as a Markdown page; values that do not agree with theory are in brackets."""
+    """The results as a Markdown page; values that disagree with theory are in brackets."""
     table, rows = experiments(), facts["rows"]
     engines = [name for name in (AUTO, "rigid", "mpm", "ngff") if any(name in row for row in rows.values())]
     yield "# Textbook physics"

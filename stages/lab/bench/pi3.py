@@ -1,6 +1,6 @@
 """Benchmark of π³: time and memory, compared with the same network with unfused attention.
 
-Random weights of the published sizes are used: time and memory do not depend on their values.
+Weights are random, with the published sizes: time and memory do not depend on their values.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from stages.lab.bench.speed_options import Pi3BenchOptions
 
 
 def naive_attention(q: Float[Tensor, "b h t d"], k: Float[Tensor, "b h t d"], v: Float[Tensor, "b h t d"]) -> Tensor:
-    """Attention that stores the scores of all token pairs, with softmax in 32 bits as under autocast."""
+    """Attention that stores the scores of all token pairs, with the softmax in 32 bits as under autocast."""
     scores = (q @ k.mT) * q.shape[-1] ** -0.5
     return scores.softmax(-1).to(v.dtype) @ v
 
@@ -40,9 +40,9 @@ def set_attention(model: nn.Module, attend: Callable) -> None:
 
 @torch.no_grad()
 def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, repeat: int) -> tuple[float, float]:
-    """Median time of a forward pass [s] and its peak memory, weights included [bytes; nan on a CPU].
+    """Median time of a forward pass [s] and its peak memory including weights [bytes; nan on a CPU].
 
-    Raises torch.OutOfMemoryError, after freeing what was allocated.
+    Raises torch.OutOfMemoryError after freeing what was allocated.
     """
     images = torch.rand(views, 3, size, size, device=device)
     half, gpu = device != "cpu", device != "cpu"
@@ -64,7 +64,7 @@ def run(
     options: Pi3BenchOptions,
     config: Pi3Config = Pi3Config(),  # noqa: B008 -- frozen
 ) -> Iterator[str]:
-    """Yield for each number of views a line with time, memory and its estimate, and one with unfused attention."""
+    """Yield two lines per number of views: time, memory and its estimate, and the same with unfused attention."""
     device = pick_device(options.device)
     half = device != "cpu"
     with torch.device(device):
@@ -92,7 +92,7 @@ def run(
         set_attention(model, naive_attention)
         try:
             if not half and _table(config, views, options.size) > 0.5 * (memory.free(device) or 0):
-                raise torch.OutOfMemoryError  # a CPU would swap, not fail
+                raise torch.OutOfMemoryError  # a CPU would swap instead of failing
             slow, more = measure(model, views, options.size, at_once, device, options.repeat)
         except torch.OutOfMemoryError:
             yield "           unfused attention: out of memory"
@@ -103,13 +103,13 @@ def run(
 
 
 def _table(config: Pi3Config, views: int, size: int) -> int:
-    """Bytes of the scores of all token pairs, twice, in 32 bits."""
+    """Bytes of the scores of all token pairs in 32 bits, twice."""
     tokens = views * ((size // PATCH) ** 2 + 5)
     return 2 * 4 * (config.width // config.head) * tokens**2
 
 
 def _finite(count: float) -> float | None:
-    """None for nan, which JSON has no number for."""
+    """The number, or None for nan, which JSON cannot represent."""
     return count if math.isfinite(count) else None
 
 

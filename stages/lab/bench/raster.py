@@ -1,8 +1,8 @@
 """Benchmark of the CPU rasteriser, compared with per-pixel compositing in the same run.
 
-Random Gaussians in a unit cube fill the image; a frame is projection, colour, sorting, binning and compositing. Wall
-time is measured on all of torch's threads, CPU time on one thread; the latter depends little on other load and is the
-number to compare.
+Random Gaussians in a unit cube fill the image. A frame is projection, colour, sorting, binning and compositing. Wall
+time is measured with all of torch's threads, CPU time with one thread; CPU time depends little on other load and is
+the number to compare.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from stages.lab.bench import common as bench
 from stages.lab.bench.raster_per_pixel import bin_into_tiles, composite_per_pixel
 from stages.lab.bench.speed_options import RasterBenchOptions
 
-FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))
-FORWARD_BACKWARD = ((50_000, 448), (100_000, 448))
-SSIM_SIZE = 448  # of the images of the SSIM benchmark [px]
+FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))  # Gaussians, image side [px]
+FORWARD_BACKWARD = ((50_000, 448), (100_000, 448))  # Gaussians, image side [px]
+SSIM_SIZE = 448  # side of the images of the SSIM benchmark [px]
 
 
 @dataclass(frozen=True)
 class RasterCase:
-    """What is timed."""
+    """The timed operation and its problem size."""
 
     what: str
     gaussians: int
-    pixels: int  # along a side of the image
+    pixels: int  # side of the image
 
     def __str__(self) -> str:
         return f"{self.what:<18}" + (f"{self.gaussians:>8,}" if self.gaussians else " " * 8) + f" {self.pixels:4d} px"
@@ -45,7 +45,7 @@ class RasterCase:
 
 @dataclass(frozen=True)
 class RasterTiming(RasterCase):
-    """One comparison [ms]: wall time on `threads` threads and CPU time on one, ours and the baseline's."""
+    """Times of our implementation and the baseline [ms]: wall time on `threads` threads and CPU time on one."""
 
     threads: int
     wall: float
@@ -62,7 +62,7 @@ class RasterTiming(RasterCase):
 
 
 def random_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """n random Gaussians that fill the unit cube around the origin; SH degree 0."""
+    """n random Gaussians that fill the unit cube around the origin, with SH degree 0."""
     rng = torch.Generator().manual_seed(seed)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
     scales = 0.3 * n ** (-1 / 3) * torch.exp(0.5 * torch.randn(n, 3, generator=rng))
@@ -73,19 +73,19 @@ def random_gaussians(n: int, seed: int = 0) -> Gaussians:
 
 
 def view_camera(pixels: int) -> tuple[Tensor, Tensor]:
-    """Extrinsics (world to camera) and intrinsics of a square image that the cube fills."""
+    """Extrinsics (world to camera) and intrinsics of a square image filled by the cube."""
     return look_at(torch.tensor([1.6, 0.9, 0.8]), torch.zeros(3)), intrinsics(pixels, pixels, 1.4 * pixels)
 
 
 def render_per_pixel(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
-    """Colour and depth (pixels, pixels, 4) on a black background, by the per-pixel baseline."""
+    """Colour and depth (pixels, pixels, 4) over black, by the per-pixel baseline."""
     tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
     splats, keys, _ = project(pack_camera(viewmat, K, pixels, pixels, 0.01), *tensors)
     return composite_per_pixel(splats, bin_into_tiles(splats, keys, pixels, pixels))
 
 
 def wall_and_cpu_ms(call: Callable[[], object], repeat: int) -> tuple[float, float]:
-    """Wall time on torch's threads and CPU time on one [ms], each the fastest of `repeat` calls."""
+    """Wall time on all of torch's threads and CPU time on one thread [ms], each the minimum of `repeat` calls."""
     call()
     wall = _fastest(call, time.perf_counter, repeat)
     threads = torch.get_num_threads()
@@ -106,7 +106,7 @@ def _fastest(call: Callable[[], object], clock: Callable[[], float], repeat: int
 
 
 def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """Time of a forward pass over n Gaussians in an image of `pixels` x `pixels`, ours and the baseline's [ms]."""
+    """Time a forward pass over n Gaussians in an image of `pixels` x `pixels`, by our code and the baseline [ms]."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels)  # noqa: E731
     plain = lambda: render_per_pixel(g, viewmat, K, pixels)  # noqa: E731
@@ -114,7 +114,7 @@ def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
 
 
 def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """The same with the backward pass: gradients of all Gaussian parameters."""
+    """Time a forward and a backward pass, with gradients of all Gaussian parameters."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels).rgb.sum()  # noqa: E731
@@ -124,7 +124,7 @@ def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
 
 
 def measure_ssim(pixels: int, repeat: int) -> RasterTiming:
-    """SSIM of two images and its gradient, compared with plain PyTorch."""
+    """Time SSIM of two images and its gradient, compared with plain PyTorch."""
     rng = torch.Generator().manual_seed(0)
     first, second = (torch.rand(pixels, pixels, 3, generator=rng) for _ in range(2))
     first.requires_grad_()

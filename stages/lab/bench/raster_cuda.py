@@ -1,10 +1,10 @@
-"""Benchmark of the rasteriser on a GPU, compared with gsplat in the same run.
+"""Benchmark of the GPU rasteriser, compared with gsplat in the same run.
 
-The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are bound by their launches;
-wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the
-splat's box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations
-each, is given as a share of the rate of a float32 matrix product in the same run. A step of the photometric fit is
-compared with the copy bandwidth.
+The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are launch-bound; wall times
+are given as well. Compositing tests every pixel of a tile against every splat in the tile's list, unless the splat's
+box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations each, is
+given as a fraction of the rate of a float32 matrix product in the same run. A step of the photometric fit is compared
+with the copy bandwidth.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from stages.reconstruct.photometric import FitOptions, fit_gaussians
 from stages.reconstruct.photos import Views
 
 OPERATIONS_PER_TEST = 10  # of the quadratic form and the comparison
-FIT_PIXELS = 640  # along a side of the image
-FIT_STEPS = 50, 190  # fits of these lengths are compared; longer ones split Gaussians
+FIT_PIXELS = 640  # side of the image of the photometric fit
+FIT_STEPS = 50, 190  # lengths of two fits whose difference gives the time of a step; longer fits split Gaussians
 
 
 @dataclass(frozen=True)
 class CudaRasterTiming(RasterCase):
-    """One comparison [ms]: kernels and wall time of a call, ours and gsplat's."""
+    """Times of a call by our code and gsplat [ms]: sum over kernels, and wall time."""
 
     kernels: float
     wall: float
     gsplat_kernels: float
     gsplat_wall: float
-    arithmetic: float | None  # share of the float32 rate reached by the tests of a forward pass
+    arithmetic: float | None  # fraction of the float32 rate that the tests of a forward pass reach
 
     def __str__(self) -> str:
         share = "" if self.arithmetic is None else f"; tests {100 * self.arithmetic:.0f} % of the float32 rate"
@@ -88,9 +88,9 @@ def run(device: str, out: Path | None, options: RasterBenchOptions) -> Iterator[
 
 
 def _fit_step(device: str, shrink: int) -> dict:
-    """Time of a step of the photometric fit, and what it must move at least as a share of the copy bandwidth.
+    """Time of a step of the photometric fit, and its minimum memory traffic as a fraction of the copy bandwidth.
 
-    That is every parameter with its gradient and its two moments, once read and once written.
+    The minimum is to read and write once every parameter, its gradient and its two moments.
     """
     n, pixels = FORWARD[0][0] // shrink, -(-FIT_PIXELS // shrink)
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
@@ -122,7 +122,7 @@ def _row(
 
 
 def _times(call: Callable[[], object], repeat: int, device: str) -> tuple[float, float]:
-    """Time of a call in kernels, and wall time [ms]."""
+    """Time of a call summed over kernels, and wall time [ms]."""
     call()
     wall = 1e3 * bench.median_seconds(call, device, repeat)
     with profile(activities=[ProfilerActivity.CUDA]) as profiler:

@@ -1,7 +1,7 @@
 """Baseline of the rasteriser benchmark: compositing with one thread per pixel, forward and backward.
 
-This is the usual form of GPU rasterisers, with tiles of 16 x 16 pixels; compiled for a CPU it is scalar code.
-Projection and sorting are ours, so that only compositing differs.
+This is the usual form on GPUs, with tiles of 16 x 16 pixels; compiled for a CPU it is scalar code. Projection and
+sorting are ours, so that only compositing differs.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_TRANSMITTANCE
 from stages.core.kernels.splat.projection import MIN_ALPHA
 
 wp.set_module_options({"enable_backward": False})
-TILE = 16  # [px]
-GRADIENT_CHANNELS = 10  # channels of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
+TILE = 16  # side of a tile [px]
+GRADIENT_CHANNELS = 10  # channels of a splat with gradients: centre, inverse covariance, opacity, colour, depth
 
 
 @wp.struct
 class FinishedPixels:
-    """Where the forward pass finished each pixel."""
+    """State of each pixel at the end of the forward pass."""
 
     left: wp.array2d[float]  # (h, w), transmittance
-    ends: wp.array2d[int]  # (h, w), one past the last splat in the list of the pixel's tile
+    ends: wp.array2d[int]  # (h, w), one past the last composited splat in the list of the pixel's tile
 
 
 @wp.func
@@ -126,7 +126,7 @@ def _finished(left: Tensor, ends: Tensor) -> FinishedPixels:
 
 
 def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, inputs: list) -> None:
-    """Launch over the image's pixels in as many pieces as there are threads."""
+    """Launch over the image's pixels, split into as many ranges as there are threads."""
     launch_ranges(kernel, even_bounds(bins.width * bins.height, num_threads()), [bins.of(splats), *inputs])
 
 
@@ -139,5 +139,5 @@ def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bin
 
 
 def composite_per_pixel(splats: Tensor, bins: Bins) -> Tensor:
-    """Composite the four channels of splats (n, 16) into an image (h, w, 4). Differentiable in the splats."""
+    """Composite four channels of splats (n, 16) into an image (h, w, 4); differentiable with respect to the splats."""
     return _Blend.apply(splats, bins)

@@ -1,8 +1,8 @@
 """Benchmark of reconstruction: camera errors against references, PSNR of held-out photos, time and memory.
 
 A photo set is a folder of photos, or a folder with photos in `images/` or `photos/`. Next to them `cameras.json` (a
-nerfstudio transforms file) may hold reference cameras; with `truth.h5`, their world is upright and has the floor height
-given there. Each set is reconstructed in a subprocess, so that its peak memory is measured alone.
+nerfstudio transforms file) may hold reference cameras. If there is also `truth.h5`, the reference world is upright and
+has the floor height given there. Each set is reconstructed in a subprocess, to measure its peak memory separately.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from stages.lab.bench.scene_options import ReconstructBenchOptions
 class PoseError:
     """Errors of estimated cameras against reference cameras of the same photos."""
 
-    cameras: int  # number of photos in both
-    rotation: float  # median over all pairs of photos of the error in their relative rotation [degrees]
-    rotation_most: float  # the largest [degrees]
-    shift: float  # RMS distance of centres after alignment by a similarity [% of the extent of the reference centres]
+    cameras: int  # number of photos present in both
+    rotation: float  # median error of the relative rotation over all pairs of photos [degrees]
+    rotation_most: float  # largest error of the relative rotation [degrees]
+    shift: float  # RMS distance of centres after similarity alignment [% of the extent of the reference centres]
 
 
 def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterator[str]:
@@ -70,13 +70,13 @@ def measure_in_subprocess(folder: Path, images: Path, options: ReconstructBenchO
 
 
 def _log_to_stderr() -> None:
-    """Progress messages of a subprocess, which inherits no logging set-up."""
+    """Set up logging in a subprocess, which does not inherit it."""
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     logging.getLogger("stages").setLevel(logging.INFO)
 
 
 def photo_folder(folder: Path) -> Path:
-    """The folder of a set's photos. Raises InputError if there is no such set."""
+    """The folder with the photos of a set. Raises InputError if the set does not exist."""
     for name in ("images", "photos"):
         if (folder / name).is_dir():
             return folder / name
@@ -86,7 +86,7 @@ def photo_folder(folder: Path) -> Path:
 
 
 def measure(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
-    """Reconstruct one set and compare it with its ground truth."""
+    """Reconstruct one set and compare it with its references, if there are any."""
     facts, found, floor = (_cameras if options.cameras_only else _scene)(images, options)
     device = pick_device(options.device)
     row = {**facts, "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
@@ -131,7 +131,7 @@ def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Came
 
 
 def pose_error(found: Cameras, reference: Cameras) -> PoseError:
-    """Errors of relative rotations, which need no alignment, and of centres aligned by a similarity.
+    """Errors of relative rotations, which need no alignment, and of centres after alignment by a similarity.
 
     Raises InputError for fewer than 3 common photos.
     """
@@ -147,10 +147,10 @@ def pose_error(found: Cameras, reference: Cameras) -> PoseError:
 
 
 def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: float) -> tuple[float, float]:
-    """Angle between the found and the true vertical [degrees], and the floor's error in height [% of scene size].
+    """Angle between estimated and true vertical [degrees], and error of the floor height [% of scene size].
 
     The worlds are aligned by the positions and orientations of all cameras. The scene size is twice the mean distance
-    of the cameras from their centroid, below which the floor heights are compared.
+    of the cameras from their centroid; floor heights are compared below this centroid.
     """
     a, b = matched_cameras(found, reference)
     move = camera_similarity(a.viewmats.double(), b.viewmats.double())
@@ -173,7 +173,7 @@ def camera_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4
 
 
 def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
-    """The cameras of photos in both, in the same order. Raises InputError for fewer than 3."""
+    """The cameras of the photos present in both, in the same order. Raises InputError for fewer than 3."""
     row = {name: i for i, name in enumerate(reference.names)}
     both = [name for name in found.names if name in row]
     if len(both) < 3:

@@ -1,4 +1,4 @@
-"""Reconstruction of a synthetic scene from rendered photos, and the labels of what its cameras see."""
+"""Reconstruction of a synthetic scene from rendered photos, and labels of the surfaces visible to its cameras."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def reconstruct_from_renders(scene: Scene, folder: Path, options: ReconstructOpt
 
 
 def visible_labels(scene: Scene, names: Sequence[str]) -> Int[Tensor, "p"]:
-    """Object number of the Gaussian with the largest weight in each pixel, over the named views in turn."""
+    """Object number of the Gaussian with the largest weight in each pixel, for the named views one after the other."""
     out = []
     for name in names:
         i = scene.cameras.names.index(name)

@@ -1,7 +1,7 @@
-"""Benchmark of hole filling under objects, on synthetic scenes, from views that no photo had.
+"""Benchmark of hole filling under objects on synthetic scenes, evaluated from novel views.
 
-The table under five objects is removed where no camera sees it and filled by `refine`; then the objects are removed and
-the table is compared with the true one in the pixels of the holes.
+The table under five objects is removed where no camera sees it, and filled by `refine`. Then the objects are removed
+and the table is compared with the true one in the pixels of the holes.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from stages.lab.bench.scene_options import RefineBenchOptions
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
 
-NOVEL_VIEWS = 4  # views from above the photos' cameras
-MAX_HIDDEN_WEIGHT = 0.02  # a table Gaussian of less weight in every photo was not seen [px]
-MIN_TABLE_ALPHA = 0.9  # alpha of a pixel that shows the table
+NOVEL_VIEWS = 4  # number of views from above the cameras of the photos
+MAX_HIDDEN_WEIGHT = 0.02  # largest total weight in any photo of a table Gaussian that counts as unseen [px]
+MIN_TABLE_ALPHA = 0.9  # smallest alpha of a pixel that shows the table
 
 
 @torch.no_grad()
 def remove_unseen_background(scene: Scene) -> Scene:
-    """The scene without background Gaussians that no camera sees."""
+    """The scene without background Gaussians that are invisible in all cameras."""
     g = scene.gaussians
     weight = torch.zeros(len(g))
     for viewmat, K, width, height in downscaled_views(scene.cameras):
@@ -59,17 +59,17 @@ def masked_psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], wh
 
 
 def measure(index: int, views: int) -> dict:
-    """Metrics of one scene, with the true object labels."""
+    """Metrics of one scene, using the true object labels."""
     scene = tabletop("apart", index, views)
     seen = remove_unseen_background(scene)
     start = time.perf_counter()
-    refined = refine(seen, RefineOptions(completer="none"))  # objects are removed anyway
+    refined = refine(seen, RefineOptions(completer="none"))  # objects are removed before the comparison
     took = time.perf_counter() - start
     views = orbit(NOVEL_VIEWS, torch.tensor([0.0, 0, TABLE_HEIGHT]), CAMERA_DISTANCE, 60.0, azimuth=10.0)
     true, _ = render_background(scene.gaussians, views, scene)
     before, _ = render_background(seen.gaussians, views, scene)
     after, _ = render_background(refined.gaussians, views, scene)
-    # the floor shows through a hole, so the holes are where the table top alone is transparent
+    # the floor is visible through a hole, so holes are found as transparent pixels of the table top alone
     tops = (g[g.means[:, 2] > TABLE_HEIGHT - 0.02] for g in (scene.gaussians, seen.gaussians))
     whole, left = (render_background(top, views, scene)[1] for top in tops)
     hole = (whole > MIN_TABLE_ALPHA) & (left < MIN_TABLE_ALPHA)

@@ -1,8 +1,8 @@
-"""Benchmark of registering a partial object to the whole, compared with plain ICP and the package splatreg.
+"""Benchmark of registering a partial object to the complete one, compared with plain ICP and the package splatreg.
 
-A part lacks 40 % of the surface, cut off by a plane or removed around a point, is noisy, and has a random pose and
-scale. A registration within 2 degrees, 2 % of scale and 1 % of the diameter counts as correct, up to the symmetry of
-the visible part.
+A part lacks 40 % of the surface, cut off by a plane or removed around a point; it is noisy, and has a random pose and
+scale. A registration within 2 degrees, 2 % of scale and 1 % of the diameter counts as correct, up to symmetries of the
+visible part.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from stages.lab.names import chosen_names
 from stages.refine.registration import register
 from stages.refine.registration_cloud import cloud_colours, diameter
 
-LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
+LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # errors of correct results: [deg], [%], [% of the diameter]
 SURFACES_OF_REVOLUTION = (
     "ball",
     "bowl",
     "can",
-)  # about z, in shape but not in colour
-MAX_SYMMETRY_RESIDUAL = 0.002  # RMS change of positions and colours by a symmetry [diameters]
-SPLATREG_GAUSSIANS = 400  # of each cloud given to splatreg; its time grows with their square
-SPLATREG_RADIUS = 0.14  # RMS radius that splatreg's absolute tolerances suit [m]
+)  # objects with rotational symmetry about z, of the shape but not of the colours
+MAX_SYMMETRY_RESIDUAL = 0.002  # RMS change of positions and colours up to which a rotation is a symmetry [diameters]
+SPLATREG_GAUSSIANS = 400  # size of the clouds given to splatreg, whose time grows with the square of it
+SPLATREG_RADIUS = 0.14  # RMS radius to which clouds are scaled to suit splatreg's absolute tolerances [m]
 
 
 @dataclass(frozen=True)
 class RegistrationTrial:
-    """A part of an object, and the true pose of the whole."""
+    """A part of an object, and the true pose of the complete object."""
 
     part: Gaussians
-    truth: Similarity  # whole to part
+    truth: Similarity  # from complete object to part
     seen: Float[Tensor, "k"]  # indices of the part in the whole
 
 
 def make_trial(whole: Gaussians, number: int, options: RegisterBenchOptions) -> RegistrationTrial:
-    """A random part; odd numbers lack the surroundings of a point, even ones a side of a plane."""
+    """A random part: odd trials remove the surroundings of a point, even ones one side of a plane."""
     rng = torch.Generator().manual_seed(1000 * options.seed + number)
     x, across = whole.means, diameter(whole.means)
     if number % 2:
@@ -76,7 +76,7 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
     """Errors of rotation [deg], scale [%], position [% of the diameter], and rotation up to symmetry [deg]."""
     middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
     shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
-    R = found.rotation.mT @ trial.truth.rotation  # the identity where the registration is exact
+    R = found.rotation.mT @ trial.truth.rotation  # identity for an exact registration
     angle = float(rotation_angle(R))
     out = {"rotation": angle, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
     symmetry = nearest_z_rotation(R)
@@ -89,7 +89,7 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
 
 
 def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation about z nearest to a rotation."""
+    """The rotation about z that is nearest to a given rotation."""
     c, s = R[0, 0] + R[1, 1], R[1, 0] - R[0, 1]
     rotation = torch.eye(3)
     rotation[:2, :2] = torch.stack([torch.stack([c, -s]), torch.stack([s, c])]) / (c * c + s * s).sqrt().clamp_min(1e-9)
@@ -97,9 +97,9 @@ def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 
 
 def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], rotation: Float[Tensor, "3 3"]) -> float:
-    """RMS difference in position and colour between the rotated visible part and the whole [diameters].
+    """RMS difference in position and colour between the rotated visible part and the complete object [diameters].
 
-    One half of the Gaussians is compared with the other; their difference without rotation is subtracted.
+    Half of the Gaussians are compared with the other half; their difference without rotation is subtracted.
     """
     joint = torch.cat([whole.means / diameter(whole.means), cloud_colours(whole.sh[:, 0] * C0 + 0.5)], 1)
     mine = joint[seen[seen % 2 == 0]]
@@ -112,7 +112,7 @@ def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], rotation: Floa
 
 
 def icp(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
-    """Plain point-to-point ICP with scale (Besl and McKay 1992), the best of 24 right-angled starts; on the CPU."""
+    """Plain point-to-point ICP with scale (Besl and McKay 1992), the best of 24 right-angled starts, on the CPU."""
     rng = torch.Generator().manual_seed(seed)
     x, y = (g.means.cpu()[torch.randperm(len(g), generator=rng)[:500]] for g in (part, whole))
     tree, ends = cKDTree(y.numpy()), []
@@ -124,7 +124,7 @@ def icp(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
 
 
 def _iterate(pose: Similarity, x: Tensor, y: Tensor, tree: cKDTree, rounds: int) -> tuple[float, Similarity]:
-    """Mean squared distance in the part's units, and the pose after some iterations."""
+    """Run ICP iterations; return the mean squared distance in the part's units, and the pose."""
     for _ in range(rounds):
         distance, index = tree.query(pose(x).numpy())
         pose = umeyama(x, y[torch.from_numpy(index)])
@@ -132,7 +132,7 @@ def _iterate(pose: Similarity, x: Tensor, y: Tensor, tree: cKDTree, rounds: int)
 
 
 def _right_angles() -> Iterator[Float[Tensor, "3 3"]]:
-    """The 24 rotations of a cube."""
+    """The 24 rotation matrices of the cube group."""
     for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2)):
         for signs in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3):
             R = torch.eye(3)[list(order)] * signs[:, None]
@@ -141,7 +141,7 @@ def _right_angles() -> Iterator[Float[Tensor, "3 3"]]:
 
 
 def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
-    """Our registration; the identity where it finds none."""
+    """Our registration; the identity if it fails."""
     found = register(part, whole, seed)
     return found.similarity.to("cpu") if found else Similarity(1.0, torch.eye(3), torch.zeros(3))
 
@@ -149,9 +149,9 @@ def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
 def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
     """Pose and scale by the package splatreg.
 
-    `init="features"` is its initialisation for partial objects; the others assume that the whole is visible and diverge
-    in scale. Its sweep over rotations keeps the initial scale, so both clouds are scaled to one size. It runs on one
-    thread: its products are so small that two threads take several times as long.
+    `init="features"` is its initialisation for partial objects; the others assume that the whole object is visible, and
+    their scale diverges. Its sweep over rotations keeps the initial scale, so both clouds are scaled to one size. It
+    runs on one thread, because its matrix products are so small that two threads take several times as long.
     """
     from splatreg import Gaussians as Theirs
     from splatreg import estimate_object_pose
@@ -179,7 +179,7 @@ if find_spec("splatreg"):
 
 
 def run(out: Path | None, options: RegisterBenchOptions) -> Iterator[str]:
-    """Register the same parts with every method; yield a line for each object. All trials go to `out` as JSON."""
+    """Register the same parts with every method; yield a line for each object. `out` receives all trials as JSON."""
     names, compared, device = chosen_names(options.only, OBJECTS), METHODS, pick_device(options.device)
     yield f"{'correct of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
     rows = []
@@ -219,7 +219,7 @@ def _placed(row: dict) -> bool:
 
 
 def summarise(rows: list[dict]) -> dict[str, float]:
-    """Fractions of correct trials, median errors and times."""
+    """Fractions of correct trials, median errors and median times."""
     middle = {k: round(float(torch.tensor([r[k] for r in rows]).median()), 3)
               for k in ("rotation", "scale", "shift", "seconds", "CPU seconds")}  # fmt: skip
     right = [_right(r) for r in rows]

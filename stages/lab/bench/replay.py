@@ -1,9 +1,9 @@
-"""Replay of a recorded run of the public MPM solver with ours: same stress, damping, walls and grid.
+"""Replay of a recorded run of the public MPM solver with our solver: same stress, damping, walls and grid.
 
-A recording is an NPZ with positions (t, p, 3) in grid coordinates, n (particles of each body, in order), volume (p),
-E and rho (one a body), nu, dt, substeps_per_frame, n_grid, grid_lim, gravity and rpic_damping. The public solver:
-fixed corotated stress; the affine part of the transfers damped by rpic_damping; in the three outermost layers of
-nodes a velocity that points outwards loses its normal component, and a tenth of the tangential one, every substep.
+A recording is an NPZ with positions (t, p, 3) in grid coordinates, n (number of particles of each body, in order),
+volume (p), E and rho (one per body), nu, dt, substeps_per_frame, n_grid, grid_lim, gravity and rpic_damping. The public
+solver has fixed corotated stress; rpic_damping damps the affine part of the transfers; in the three outermost layers of
+nodes, outward velocities lose their normal component and a tenth of the tangential component in every substep.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from stages.lab.bench.motion_options import ReplayOptions
 RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
                     "gravity", "rpic_damping"}  # fmt: skip
 SCALARS = ("nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "rpic_damping")
-WALL_LAYERS = 3  # layers of nodes outside the walls
-WALL_DAMPING = 0.9  # factor on the tangential velocity at a wall, every substep
-CONTACT_DEVIATION = 1e-3  # deviation from free fall that shows a contact [drop heights]
+WALL_LAYERS = 3  # node layers outside the walls
+WALL_DAMPING = 0.9  # factor on the tangential velocity at a wall, per substep
+CONTACT_DEVIATION = 1e-3  # deviation from free fall that indicates a contact [drop heights]
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ReplayErrors:
     drop: float  # largest descent of a centre of mass [m]
     contact: int  # first frame in which a body deviates from free fall
     com: Tensor  # (t, o) distances between centres of mass
-    particles: Tensor  # (t) largest distance between particles; meaningful before the first contact
+    particles: Tensor  # (t) largest distance between particles; meaningful only before the first contact
 
 
 def read_recording(path: Path) -> dict[str, np.ndarray]:
@@ -68,7 +68,7 @@ def read_recording(path: Path) -> dict[str, np.ndarray]:
 
 
 def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
-    """Our solver at the first frame, with grid nodes where the public solver has them."""
+    """Our solver at the first frame, with the same grid nodes as the public solver."""
     n = torch.from_numpy(data["n"]).long()
     each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
     x = torch.from_numpy(data["positions"][0]).float()
@@ -85,7 +85,7 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
 
 
 def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[Tensor]:
-    """Positions (p, 3) of our run, frame by frame, from the first recorded frame. Raises InputError on divergence."""
+    """Positions (p, 3) of our run, frame by frame, from the first recorded frame. Raises InputError if it diverges."""
     solver = make_solver(data, device)
     steps = int(data["substeps_per_frame"])
     push = torch.from_numpy(data["gravity"]).float().repeat(len(solver.rows), 1).to(device)
@@ -108,7 +108,7 @@ def compare(data: dict[str, np.ndarray], ours: Tensor) -> ReplayErrors:
         raise InputError("nothing falls in this recording")
     dt = float(data["dt"])
     steps = torch.arange(len(com)).double() * int(data["substeps_per_frame"])
-    # the public solver adds gravity before it moves particles: after s substeps they fell g dt^2 s (s + 1) / 2
+    # the public solver adds gravity before moving particles: after s substeps they have fallen g dt^2 s (s + 1) / 2
     fallen = torch.from_numpy(data["gravity"]).double() * dt**2 * (steps * (steps + 1) / 2)[:, None]
     off = (com - com[0] - fallen[:, None]).norm(dim=2).amax(1) > CONTACT_DEVIATION * drop
     contact = int(off.nonzero()[0]) if bool(off.any()) else len(com)

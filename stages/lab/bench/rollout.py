@@ -1,9 +1,9 @@
 """Benchmark of rollout time: our force field, compared with the published model and MPM in the same run.
 
-Ellipsoids in piles of three fall onto each other and onto the floor, 100 steps of 0.02 s. The time covers everything
-from the keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks,
-integration; Gaussians are not moved. The operations of the networks are given as a share of the rate of a float32
-matrix product. Recording a CUDA graph, once for a model and a problem size, is reported separately.
+Ellipsoids in stacks of three fall onto each other and onto the floor for 100 steps of 0.02 s. The time covers all work
+from the keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks and
+integration, but not skinning of Gaussians. The operations of the networks are given as a fraction of the rate of a
+float32 matrix product. Recording a CUDA graph, once per model and problem size, is reported separately.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
 from stages.lab.bench.speed_options import RolloutBenchOptions
 
-PILE, PILE_WIDTH = 3, 0.7  # objects above each other, and from one pile to the next [m]
+PILE, PILE_WIDTH = 3, 0.7  # objects in a stack, and distance between stacks [m]
 PEER = "ngff-paper, step by step"  # the baseline, as published
 
 
 def ellipsoids(scenes: int, keypoints: int, objects: int = PILE) -> InitialConditions:
-    """Copies of one scene of ellipsoidal shells above each other and above the floor, in a row of piles of three."""
+    """Copies of one scene of ellipsoidal shells, stacked in threes above the floor in a row."""
     rng = torch.Generator().manual_seed(0)
     ball = torch.nn.functional.normalize(torch.randn(objects, keypoints, 3, generator=rng), dim=-1)
     offsets = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
@@ -51,7 +51,7 @@ def run(out: Path, options: RolloutBenchOptions) -> Iterator[str]:
     device = pick_device(options.device)
     model, card = checkpoints.load(checkpoints.find("ngff", options.weights), device)
     torch.manual_seed(0)
-    paper = checkpoints.build("ngff-paper").to(device).eval()  # untrained: a step takes the same time
+    paper = checkpoints.build("ngff-paper").to(device).eval()  # untrained, which does not change the time of a step
     yield bench.machine(device)
     facts = {
         "machine": bench.machine(device), "threads": torch.get_num_threads(),
@@ -74,7 +74,7 @@ def run(out: Path, options: RolloutBenchOptions) -> Iterator[str]:
 def _measured(
     model: Dynamics, paper: Dynamics, scenes: int, device: str, options: RolloutBenchOptions
 ) -> Iterator[dict]:
-    """A row for each model and way of rolling out a batch of scenes."""
+    """A row for each model and method of rolling out a batch of scenes."""
     start, count = ellipsoids(scenes, options.keypoints, options.objects).to(device), options.steps + 1
     plain = rollout_stepwise(model, start, count)
     yield _row("ngff, step by step", scenes, lambda: rollout_stepwise(model, start, count), device, options.repeat)
@@ -82,7 +82,7 @@ def _measured(
         torch.set_float32_matmul_precision(precision)
         began = time.perf_counter()
         stepper = TimeStepper(model, start)
-        _again(stepper, start, 2)  # captures both graphs
+        _again(stepper, start, 2)  # captures both CUDA graphs
         ready = time.perf_counter() - began
         name = f"ngff, {'in tf32, ' * (precision == 'high')}replayed"
         yield {
@@ -106,7 +106,8 @@ def _measured(
 def _operations(model: Dynamics, options: RolloutBenchOptions, device: str) -> int:
     """Operations of the matrix products in a rollout of one scene.
 
-    With autograd on there are no fused kernels, whose operations PyTorch does not count; no graph is kept.
+    Autograd is enabled because it disables the fused kernels, whose operations PyTorch does not count. No parameter
+    requires a gradient, so no autograd graph is kept.
     """
     model, start = (
         copy.deepcopy(model).requires_grad_(False),
@@ -119,7 +120,7 @@ def _operations(model: Dynamics, options: RolloutBenchOptions, device: str) -> i
 
 @torch.no_grad()
 def rollout_stepwise(model: Dynamics, start: InitialConditions, count: int) -> Float[Tensor, "b t o n 3"]:
-    """A rollout step by step, without a CUDA graph. [m]"""
+    """A rollout step by step, without a CUDA graph [m]."""
     return model.rollout(start, count, FRAME)
 
 
@@ -129,7 +130,7 @@ def _again(stepper: TimeStepper, start: InitialConditions, count: int) -> Float[
 
 
 def _row(what: str, scenes: int, function: Callable[[], object], device: str, repeat: int) -> dict:
-    """A row with the median wall time and, on a CPU, the minimum CPU time."""
+    """A row with the median wall time and, on a CPU, the minimum CPU time [s]."""
     function()
     wall, cpu = [], []
     for _ in range(repeat):

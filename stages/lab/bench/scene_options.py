@@ -12,7 +12,7 @@ from stages.reconstruct.options import ReconstructOptions
 
 @dataclass(frozen=True)
 class ReconstructBenchOptions:
-    """Options of the reconstruction."""
+    """Quality and parts of the reconstruction."""
 
     quality: str = option("normal", "quality of the reconstruction")
     holdout: int = option(8, "hold out every N-th photo", min=0)
@@ -21,7 +21,7 @@ class ReconstructBenchOptions:
     cameras_only: bool = option(False, "stop after the cameras are estimated, to compare matchers")
 
     def key(self, folder: Path) -> str:
-        """Name of a set's row in the results."""
+        """Key of a set's row in the results."""
         matcher = "" if self.matcher == "sift" else f", {self.matcher}"
         cameras = ", cameras" if self.cameras_only else ""
         return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
@@ -29,7 +29,7 @@ class ReconstructBenchOptions:
 
 @dataclass(frozen=True)
 class AppearanceBenchOptions:
-    """Options of the reconstruction."""
+    """Quality of the reconstruction, and its held-out photos."""
 
     quality: str = option("high", "quality of the reconstruction")
     holdout: int = option(8, "hold out every N-th photo")
@@ -41,13 +41,13 @@ class AppearanceBenchOptions:
         self.reconstruction()
 
     def reconstruction(self) -> ReconstructOptions:
-        """Options of `ngff reconstruct`."""
+        """The options of `ngff reconstruct`."""
         return ReconstructOptions(quality=self.quality, holdout=self.holdout)
 
 
 @dataclass(frozen=True)
 class SegmentBenchOptions:
-    """Scenes and methods; two scenes show all ten objects."""
+    """Scenes and methods; two scenes together show all ten objects."""
 
     scenes: int = option(4, "scenes of each kind: separate objects, and objects in contact")
     views: int = option(24, "number of cameras per scene")
@@ -62,7 +62,7 @@ class SegmentBenchOptions:
 
 @dataclass(frozen=True)
 class SegmentPhotosOptions:
-    """Where labels and ready scenes are."""
+    """Locations of label images and of scenes that are already segmented."""
 
     labels: Path | None = option(
         None, "of photo sets: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
@@ -75,10 +75,10 @@ class SegmentPhotosOptions:
 
 @dataclass(frozen=True)
 class SegmentAblationOptions:
-    """Length of the trainings."""
+    """Length and batch size of each training."""
 
     steps: int = option(1500, "training steps of each network", min=1)
-    voxels: int = 14_000
+    voxels: int = 14_000  # per crop
     batch: int = option(4, "crops per step", min=1)
     workers: int = option(0, "processes that prepare crops; 0: the training process itself", min=0)
     seed: int = seed_option()
@@ -87,11 +87,11 @@ class SegmentAblationOptions:
 
 @dataclass(frozen=True)
 class SegmentAblationData:
-    """Folders of scenes as `ngff-lab clutter --reconstruct` and `--exact` write; no scene may be in two of them."""
+    """Folders of scenes written by `ngff-lab clutter --reconstruct` and `--exact`; no scene may be in two of them."""
 
-    train: Sequence[Path]  # with reconstructions, and the true Gaussians of the same scenes
-    scores: Sequence[Path]
-    judge: Sequence[Path]
+    train: Sequence[Path]  # reconstructions, and the true Gaussians of the same scenes
+    scores: Sequence[Path]  # for training the scores of candidates
+    judge: Sequence[Path]  # for evaluation
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,9 @@ class RegisterBenchOptions:
 
     only: str = option("", "names of the objects, such as ball,duck; default: all ten")
     trials: int = option(10, "partial views of each object", min=1)
-    missing: float = 0.4  # fraction of the surface
-    noise: float = 0.01  # standard deviation of positions [diameters]
-    tint: float = 0.02  # standard deviation of colours [0..1]
+    missing: float = 0.4  # fraction of the surface that is removed
+    noise: float = 0.01  # standard deviation of the noise of positions [diameters]
+    tint: float = 0.02  # standard deviation of the noise of colours [0..1]
     seed: int = seed_option()
     device: str = device_option()
 
@@ -129,8 +129,8 @@ class CompleteBenchOptions:
         "--scene",
     )
     known: str = option("", "names of the objects in the library; default: all ten")
-    thin: int = 2  # every n-th Gaussian of an object is used
-    noise: float = 0.003  # standard deviation of positions [longest sides]
-    frames: int = 40  # frames of motion
-    lift: float = 0.2  # height that the objects are dropped from [m]
+    thin: int = 2  # only every n-th Gaussian of an object is used
+    noise: float = 0.003  # standard deviation of positions [object sizes]
+    frames: int = 40  # simulated frames
+    lift: float = 0.2  # drop height of the objects [m]
     seed: int = seed_option()

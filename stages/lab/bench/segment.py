@@ -1,9 +1,9 @@
 """Benchmark of `segment` on synthetic scenes: intersection over union (IoU) with each true object.
 
-A scene has five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
-without labels, and the cameras. Label images are the true ones or corrupted ones; the vote over views is compared with
-labels without a vote. SAM 2.1 is included where its weights are installed. On request rendered photos of each scene are
-reconstructed and segmented by the backends without prompts, and the IoU is measured in pixels.
+A scene has five of the ten objects on one of the eight tables, apart or touching; `segment` receives the true Gaussians
+without labels, and the cameras. Label images are the true ones or corrupted; voting over views is compared with labels
+without voting. SAM 2.1 is included if its weights are installed. Optionally, rendered photos of each scene are also
+reconstructed and segmented by the backends that need no prompts, with the IoU measured in pixels.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from stages.segment.boxes import segment as boxes_segment
 from stages.segment.options import BACKENDS, SegmentOptions
 
 log = logging.getLogger(__name__)
-ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and pixels in each photo
-AUTOMATIC = ("geometric", "learned")  # backends that need no prompts and no further weights
-MASK_SHIFT = 20  # standard deviation of the shift of masks at an error rate of 1 [px]
+ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and of wrong pixels in each label image
+AUTOMATIC = ("geometric", "learned")  # backends that need no prompts and no additional weights
+MASK_SHIFT = 20  # standard deviation of the random shift of masks, per unit of error rate [px]
 
 
 def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
-    """IoU of each true object with the found object that fits it best.
+    """IoU of each true object with the best-fitting found object.
 
     `found` and `truth` are labels of the same Gaussians, or of the same pixels; 0 is the background.
     """
@@ -54,7 +54,7 @@ def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> d
 def corrupt_labels(
     labels: Int[Tensor, "h w"], rate: float, objects: int, rng: np.random.Generator
 ) -> Int[Tensor, "h w"]:
-    """A label image with a fraction of its objects missed or swapped and of its pixels random, shifted a little."""
+    """A shifted label image with a fraction of its objects missing or swapped, and of its pixels random."""
     chance = rng.uniform(size=objects)
     taken = [0, *(0 if u < rate / 2 else int(rng.integers(1, objects + 1)) if u < rate else i
                   for i, u in enumerate(chance, start=1))]  # fmt: skip
@@ -65,9 +65,9 @@ def corrupt_labels(
 
 
 def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Callable[[], Int[Tensor, "n"]]]:
-    """Segmentations from label images of all views, by error rate, with and without a vote.
+    """Segmentations from label images of all views, by error rate, with and without voting.
 
-    `scene` has no labels. At an error rate of 0.4, for example, the images of a fifth of the views are missing as well.
+    `scene` has no labels. A fraction of half the error rate of the images is also missing.
     """
     objects, rng = int(truth.max()), np.random.default_rng(seed)
     votes = {rate: torch.zeros(len(truth), 1) for rate in ERROR_RATES}
@@ -91,7 +91,7 @@ def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[s
 
 
 def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Object numbers from tight boxes in the view whose least visible object is most visible."""
+    """Object numbers from tight boxes, in the view in which the least visible object has the most pixels."""
 
     def shown(view: int) -> Int[Tensor, "h w"]:
         front = ViewFootprint.of(scene, view).front
@@ -114,20 +114,20 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
 
 
 def segment_by_network(scene: Scene, name: str, options: SegmentBenchOptions) -> Int[Tensor, "n"]:
-    """Object ids of a network backend, without prompts, from rendered views of the scene."""
+    """Object ids found by a network backend without prompts in rendered views of the scene."""
     chosen = SegmentOptions(backend=name, weights=options.weights, device=options.device)
     return load(BACKENDS[name].entry)(scene, chosen).gaussians.object_id
 
 
 def segment_without_prompts(scene: Scene, name: str, device: str) -> Scene:
-    """The scene with the objects that a backend of AUTOMATIC finds with its default options."""
+    """The scene with the objects that a backend of AUTOMATIC finds with default options."""
     return load(BACKENDS[name].entry)(scene, SegmentOptions(backend=name, device=device))
 
 
 def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[str]]:
-    """Names of the network backends whose weights are present, and a message for each of the others.
+    """Names of the network backends whose weights are available, and a message for each of the others.
 
-    Raises InputError where weights were given that no backend accepts.
+    Raises InputError if `options.weights` is not accepted by any backend.
     """
     found, absent = [], []
     for name, row in BACKENDS.items():
@@ -144,7 +144,7 @@ def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[st
 
 
 def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOptions) -> list[dict]:
-    """A row for each method on one scene: IoU of each object, and seconds without rendering label images."""
+    """A row for each method on one scene: IoU of each object, and time without rendering label images [s]."""
     scene = tabletop(kind, index, options.views)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
@@ -162,9 +162,9 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
 
 
 def measure_reconstructed(kind: str, index: int, options: SegmentBenchOptions) -> list[dict]:
-    """A row for each backend of AUTOMATIC on one reconstruction: IoU in the pixels of the photos with cameras.
+    """A row for each backend of AUTOMATIC on one reconstruction: IoU in the pixels of the placed photos.
 
-    The seconds are without the reconstruction. The IoU is 0 where no camera could be estimated or nothing segmented.
+    The time excludes the reconstruction. The IoU is 0 if no camera could be estimated or nothing was segmented.
     """
     scene, made, names = tabletop(kind, index, options.views), None, ()
     try:
@@ -188,7 +188,7 @@ def measure_reconstructed(kind: str, index: int, options: SegmentBenchOptions) -
 
 
 def _scores(scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
-    """IoU of each object and their mean, number of objects found, and seconds since `start`."""
+    """IoU of each object and their mean, number of objects found, and time since `start` [s]."""
     named = {scene.name_of(i): round(value, 3) for i, value in best_ious(found, truth).items()}
     return {"iou": named, "found": len(found.unique()) - 1, "mean": float(np.mean(list(named.values()))),
             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip

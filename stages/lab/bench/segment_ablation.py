@@ -1,7 +1,7 @@
-"""Ablation of the segmentation network: trained anew without one of its inputs, classes or kinds of data.
+"""Ablation of the segmentation network: retrained without one of its inputs, classes or kinds of data.
 
-Each network is trained from scratch on the same scenes for the same number of steps, its scores on other scenes, and
-the objects that it finds in a third set are compared with the true ones, surfel by surfel, before outlines are cut.
+Each network is trained from scratch on the same scenes for the same number of steps, and its scores on other scenes.
+The objects that it finds in a third set are compared with the true ones, surfel by surfel, before outlines are cut.
 """
 
 from __future__ import annotations
@@ -38,24 +38,25 @@ from stages.lab.training.train_segmenter import fit_network
 log = logging.getLogger(__name__)
 COLOUR_INPUTS = tuple(range(FEATURES))[LAB]
 SHAPE_INPUTS = tuple(i for i in range(FEATURES) if i not in COLOUR_INPUTS)
-COLOUR_CONTRASTS = (CANDIDATE_FEATURES - 6, CANDIDATE_FEATURES - 5, CANDIDATE_FEATURES - 4)  # before the embedding's
-TRAINING = {"score_scenes": 100, "score_steps": 3000}  # settings of all trainings
+# columns of the colour contrasts of a candidate, which precede the contrasts of the embedding
+COLOUR_CONTRASTS = (CANDIDATE_FEATURES - 6, CANDIDATE_FEATURES - 5, CANDIDATE_FEATURES - 4)
+TRAINING = {"score_scenes": 100, "score_steps": 3000}  # settings shared by all trainings
 HEADINGS = ["without", "recall", "PQ", "SQ", "RQ", "objects", "found", "pair loss"]
 
 
 class _MaskedSegmenter(Segmenter):
-    """The network with some inputs of voxels, and some features of candidates, set to 0."""
+    """The network with some voxel inputs and some candidate features set to 0."""
 
     def __init__(self, inputs: Sequence[int], features: Sequence[int], widths: tuple[int, ...], blocks: int):
         super().__init__(widths, blocks)
         self.inputs, self.features = list(inputs), list(features)
 
     def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
-        """Predictions without the inputs that are left out."""
+        """Predictions with the ablated inputs set to 0."""
         return super().forward(_without(features, self.inputs), levels)
 
     def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
-        """Scores without the features that are left out."""
+        """Scores with the ablated features set to 0."""
         return super().score(_without(features, self.features))
 
 
@@ -66,18 +67,18 @@ def _without(x: Float[Tensor, "n f"], columns: Sequence[int]) -> Float[Tensor, "
 
 
 def _clutter_as_surface(t: Targets) -> Targets:
-    """Targets with two classes: what is clutter counts as surface."""
+    """Targets with two classes: clutter is relabelled as surface."""
     return replace(t, classes=torch.where(t.classes == 2, 0, t.classes))
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What a network is trained without."""
+    """An ablation: what the network is trained without."""
 
-    without: str  # for the table
-    inputs: tuple[int, ...] = ()  # of voxels
-    features: tuple[int, ...] = ()  # of candidates
-    observation: str = RECONSTRUCTED  # kind of the training's examples
+    without: str  # description for the table
+    inputs: tuple[int, ...] = ()  # columns of voxel features that are set to 0
+    features: tuple[int, ...] = ()  # columns of candidate features that are set to 0
+    observation: str = RECONSTRUCTED  # kind of training examples
     change: Callable[[Targets], Targets] = lambda t: t
 
 
@@ -92,9 +93,9 @@ ABLATIONS = {
 
 
 def run(data: SegmentAblationData, out: Path, options: SegmentAblationOptions, only: str = "") -> Iterator[str]:
-    """Train each ablation, or those named in `only` (separated by commas); yields a line about each.
+    """Train each ablation, or those named in `only` (comma-separated); yield a line for each.
 
-    OUT is JSON, with a table beside it.
+    OUT receives JSON; a table is written next to it.
     """
     names = chosen_names(only, ABLATIONS)
     device = pick_device(options.device)
@@ -108,7 +109,7 @@ def run(data: SegmentAblationData, out: Path, options: SegmentAblationOptions, o
 
 
 def measured(choice: Variant, data: SegmentAblationData, options: SegmenterTraining, device: str) -> dict:
-    """Train one ablation and judge it."""
+    """Train one ablation and evaluate it."""
     torch.manual_seed(options.seed)
     model = _MaskedSegmenter(choice.inputs, choice.features, options.widths, options.blocks).to(device).train()
     curve: list[dict] = []
@@ -122,25 +123,25 @@ def measured(choice: Variant, data: SegmentAblationData, options: SegmenterTrain
 
 
 def panoptic_scores(model: Segmenter, files: Sequence[Path]) -> PanopticScores:
-    """Recall, PQ and so on of all objects of MIN_SURFELS or more in the examples `files`, in surfels."""
+    """Recall, PQ and related scores of all objects of MIN_SURFELS or more in the examples, counted in surfels."""
     overlap = LabelOverlap()
     for k, file in enumerate(tqdm(files, desc="judged", unit="scene")):
         example = read_example(file)
         truth, found = _known(example), found_objects(model, example)
-        first = 10_000 * k  # objects of different scenes are different
+        first = 10_000 * k  # offset that keeps the objects of different scenes apart
         overlap.add(*(torch.where(x > 0, first + x, 0) for x in (truth, found)), example.labels >= 0)
     return overlap.scores()
 
 
 def _known(example: Example) -> Tensor:
-    """True object of each surfel, 0 for none and for objects of few surfels."""
+    """True object of each surfel; 0 for none and for objects with fewer than MIN_SURFELS."""
     labels = example.labels.clamp_min(0)
     return torch.where(labels.bincount()[labels] >= MIN_SURFELS, labels, 0)
 
 
 @torch.no_grad()
 def found_objects(model: Segmenter, example: Example) -> Tensor:
-    """Object of each surfel that the network finds, 0 for none, before outlines are cut."""
+    """Object that the network assigns to each surfel, 0 for none, before outlines are cut."""
     scored = [score_at(example.surfels, scale, model) for scale in SCALES]
     return best_objects([s.best(ObjectLimits()) for s in scored])
 

@@ -1,8 +1,8 @@
 """Benchmark of `segment` on real photos: recall, IoU and panoptic quality against label images.
 
 Each photo set is reconstructed and segmented with default options, and its objects are compared with the label images
-of some of its photos. Compared with the same scene labelled by those label images themselves, by the vote that
-`segment --masks` uses: no segmentation of this reconstruction can be expected to be much better.
+of some of its photos. The reference is the same scene labelled by those label images, with the voting of `segment
+--masks`: no segmentation of this reconstruction can be expected to be much better.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from stages.lab.bench import common as bench
 from stages.lab.bench.reconstruct import photo_folder
 from stages.lab.bench.scene_options import SegmentPhotosOptions
 
-METRICS = {"recall": "recall", "PQ": "PQ", "SQ": "SQ", "RQ": "RQ", "IoU": "mean IoU"}  # key: heading
+METRICS = {"recall": "recall", "PQ": "PQ", "SQ": "SQ", "RQ": "RQ", "IoU": "mean IoU"}  # key in the results: heading
 HEADINGS = ["set", "photos placed", "labelled", "objects", "found", *METRICS.values(), "false share", "PQ by labels",
             "reconstruct", "segment"]  # fmt: skip
 
 
 def run(sets: list[Path], out: Path | None, options: SegmentPhotosOptions) -> Iterator[str]:
-    """Yield a line for each set; all results go to `out` as JSON, and as a table to a Markdown file beside it.
+    """Yield a line for each set; `out` receives all results as JSON, and a Markdown file next to it the table.
 
     The row of a set that cannot be reconstructed holds the error message.
     """
@@ -54,7 +54,7 @@ def run(sets: list[Path], out: Path | None, options: SegmentPhotosOptions) -> It
 
 
 def labels_of(folder: Path, options: SegmentPhotosOptions) -> Path:
-    """The folder of label images of a photo set; InputError where there is none."""
+    """The folder of label images of a photo set. Raises InputError if there is none."""
     given = options.labels
     places = [folder / "labels"] if given is None else [Path(given) / folder.resolve().name, Path(given)]
     found = next((place for place in places if (place / "names.json").exists()), None)
@@ -64,7 +64,7 @@ def labels_of(folder: Path, options: SegmentPhotosOptions) -> Path:
 
 
 def measure(name: str, photos: Path, labels: Path, options: SegmentPhotosOptions) -> dict:
-    """The row of one set; only the message where its photos or labels do not work."""
+    """The row of one set; only the error message if its photos or labels cannot be used."""
     with tempfile.TemporaryDirectory() as temporary:
         path, by_labels = Path(options.labelled or temporary) / f"{name}.ply", Path(temporary) / "by_labels.ply"
         try:
@@ -79,7 +79,7 @@ def measure(name: str, photos: Path, labels: Path, options: SegmentPhotosOptions
 
 
 def _make(photos: Path, path: Path, options: SegmentPhotosOptions) -> dict[str, float]:
-    """Reconstruct and segment a photo set with default options; seconds of each stage."""
+    """Reconstruct and segment a photo set with default options; return the time of each stage [s]."""
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.stage import run as reconstruct
     from stages.segment.stage import run as segment
@@ -94,7 +94,7 @@ def _make(photos: Path, path: Path, options: SegmentPhotosOptions) -> dict[str, 
 
 
 def label_by_truth(scene: Scene, path: Path, labels: Path) -> Scene:
-    """The scene of the file `path`, labelled by the vote of the label images; pixels not judged are background."""
+    """The scene of the file `path`, labelled by voting of the label images; ignored pixels count as background."""
     blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
     blank = replace(scene, gaussians=blank, objects=())
     images = ((view, read_truth(file, scene.cameras, view)) for view, file in

@@ -44,7 +44,7 @@ class Pi3BenchOptions:
     splats: bool = option(False, "include the Gaussian head")
 
     def __post_init__(self):
-        from stages.core.models.pi3.dinov2 import PATCH  # imports PyTorch, which --help does not wait for
+        from stages.core.models.pi3.dinov2 import PATCH  # imports PyTorch, which would slow down --help
 
         if self.size < PATCH or self.size % PATCH or self.repeat < 1 or min(self.views, default=0) < 1:
             raise InputError(f"--size must be a multiple of {PATCH}, --views and --repeat at least 1")
@@ -69,7 +69,7 @@ class RolloutBenchOptions:
 
 @dataclass(frozen=True)
 class ChainBenchOptions:
-    """What is run."""
+    """Which stages are run, how, and how often."""
 
     quality: str = option("normal", "quality of the reconstruction")
     device: str = device_option()

@@ -41,19 +41,19 @@ from stages.reconstruct.stage import run as reconstruct
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run as segment
 
-MATCHED = 0.06  # largest distance of an object that was found from the true one, at the release [m]
+MATCHED = 0.06  # largest distance between a found and a true object at the release for a match [m]
 
 
 class PoseErrors(NamedTuple):
-    """Of each true object in each frame, and whether it was seen; nan and false for objects that were not found."""
+    """Errors of each true object in each frame; nan (and not seen) for objects that were not found."""
 
-    distance: Float[Tensor, "t o"]  # of its middle [m]
-    angle: Float[Tensor, "t o"]  # of its rotation since the release [degrees]
+    distance: Float[Tensor, "t o"]  # of the object's centre [m]
+    angle: Float[Tensor, "t o"]  # of the rotation since the release [degrees]
     seen: Bool[Tensor, "t o"]
 
 
 def measure(stand_in: StandIn, folder: Path, device: str, quality: str = "") -> dict:
-    """Errors of the track of a stand-in, which is filmed into the folder; see TrackBenchOptions for `quality`."""
+    """Film a stand-in into a folder, track it, and return the errors; see TrackBenchOptions for `quality`."""
     films, truth, out = folder / "films", folder / "truth.h5", folder / "track.h5"
     write_films(stand_in, films)
     write_truth(stand_in, truth)
@@ -69,7 +69,7 @@ def measure(stand_in: StandIn, folder: Path, device: str, quality: str = "") -> 
 
 
 def true_scene(stand_in: StandIn, folder: Path) -> Path:
-    """The scene file of a stand-in as it is, with the times that its films tell."""
+    """Write the true scene of a stand-in, with film starts estimated from the films."""
     _, sequence = read_sequence(folder / "films", ReconstructOptions(sequence=True))
     write_scene(folder / "scene.ply", replace(stand_in.scene, sequence=sequence))
     return folder / "scene.ply"
@@ -85,7 +85,7 @@ def reconstructed_scene(stand_in: StandIn, folder: Path, device: str, quality: s
 
 
 def errors_of(stand_in: StandIn, tracked: Trajectory, true: Trajectory) -> dict:
-    """Errors of a track, and which objects and frames it flags, for all objects together and for each."""
+    """Errors of a track, and how many object frames it flags as lost, in total and for each object."""
     errors, frames = pose_errors(tracked, true), len(tracked)
     covered, open_ = _covered(stand_in, errors.seen.shape)
     starts = tracked.scene.provenance["starts"]
@@ -101,7 +101,7 @@ def errors_of(stand_in: StandIn, tracked: Trajectory, true: Trajectory) -> dict:
 
 
 def _summary(errors: PoseErrors, covered: Bool[Tensor, "t o"], open_: Bool[Tensor, "t o"]) -> dict:
-    """Quantiles of the errors where objects were seen, and numbers of frames."""
+    """Quantiles of the errors over seen objects, and numbers of frames."""
     seen, row = errors.seen, {}
     for name, values in (("position_mm", 1000 * errors.distance[seen]), ("rotation_deg", errors.angle[seen])):
         known = values if len(values) else torch.tensor([torch.nan])
@@ -115,9 +115,9 @@ def _summary(errors: PoseErrors, covered: Bool[Tensor, "t o"], open_: Bool[Tenso
 
 
 def pose_errors(tracked: Trajectory, true: Trajectory) -> PoseErrors:
-    """The motion since the first frame of the objects that were found, against the true one, in the true world.
+    """Errors of the motion since the first frame, in the true world.
 
-    A true object is the one found nearest to it in the first frame.
+    Each true object is matched with the nearest found object in the first frame.
     """
     frames, shape = len(tracked), (len(tracked), len(true.scene.objects))
     world = _world(tracked.scene, true.scene)
@@ -138,16 +138,16 @@ def pose_errors(tracked: Trajectory, true: Trajectory) -> PoseErrors:
 
 
 def _world(found: Scene, true: Scene) -> Similarity:
-    """From the world of a scene that was found to the true one, by their cameras."""
+    """Similarity from the world of a reconstructed scene to the true world, by their cameras."""
     names = {name: i for i, name in enumerate(true.cameras.names)}
     rows = [names[name] for name in found.cameras.names]
     return umeyama(centres(found.cameras.viewmats), centres(true.cameras.viewmats[rows]))
 
 
 def _covered(stand_in: StandIn, shape: tuple[int, int]) -> tuple[Bool[Tensor, "t o"], Bool[Tensor, "t o"]]:
-    """Frames and objects that are covered in all films but one or none, and those that are covered in none.
+    """Masks of object frames that are covered in at least all films but one, and of those covered in no film.
 
-    Films show the disc from different frames of the track on, as their pictures are taken at different times.
+    The cover appears at different frames of the track in each film, since images are taken at different times.
     """
     count = torch.zeros(shape, dtype=torch.int64)
     for start in stand_in.starts.values():
@@ -158,18 +158,18 @@ def _covered(stand_in: StandIn, shape: tuple[int, int]) -> tuple[Bool[Tensor, "t
 
 
 def _offset_error(found: dict[str, float], true: dict[str, float]) -> float:
-    """Largest error of a film's time relative to the mean of all [frames]."""
+    """Largest error of a film's start relative to the mean of all films [frames]."""
     late = torch.tensor([start - true[name] for name, start in found.items()])
     return float((late - late.mean()).abs().max())
 
 
 def _release_error(found: dict[str, float], true: dict[str, float]) -> float:
-    """How much later than the release the motion is taken to begin [frames]."""
+    """Delay of the estimated release after the true one [frames]."""
     return float(torch.tensor([start - true[name] for name, start in found.items()]).mean())
 
 
 def run(out: Path | None, options: TrackBenchOptions) -> Iterator[str]:
-    """Lines of a table of all sequences, and JSON in `out`."""
+    """Yield the lines of a table of all sequences; `out` receives the results as JSON."""
     device, results = pick_device(options.device), {}
     yield (f"{'sequence':<10}{'position':>11}{'rotation':>10}{'flagged: covered':>18}{'others':>10}{'offsets by':>12}"
            f"{'refined':>9}{'release':>9}")  # fmt: skip

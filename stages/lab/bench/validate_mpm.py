@@ -1,8 +1,9 @@
-"""Validation of the MPM solver against theory: the figure of stages/lab/results/mpm.md; tests check one setting each.
+"""Validation of the MPM solver against theory, and the figure of stages/lab/results/mpm.md.
 
     python -m stages.lab.bench.validate_mpm stages/lab/results/mpm.png
 
-Every function simulates a small scene with a known outcome and returns the measured and the expected value.
+Every function simulates a small scene with a known outcome and returns the measured and the expected value. Tests check
+one setting of each.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from stages.core.kernels.mpm.constitutive import SAND, sand_slope
 from stages.core.physics.mpm import solver as mpm
 
 OPEN_BOX = mpm.Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
-E, DENSITY = 1e5, 500.0
+E, DENSITY = 1e5, 500.0  # [Pa] [kg/m^3]
 
 
 def particle_block(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosity: float = 0.0, jitter: float = 0.0,
             **material) -> mpm.Particles:  # fmt: skip
-    """A box of particles at the centres of voxels of edge h [m], its lower corner at the origin."""
+    """A box of particles at the centres of voxels with edge h [m], its lower corner at the origin."""
     counts = [max(1, round(s / h)) for s in size]
     x = (torch.cartesian_prod(*[torch.arange(n) + 0.5 for n in counts]) * h).reshape(-1, 3)
     x = x + jitter * h * (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5)
@@ -36,15 +37,15 @@ def subset(p: mpm.Particles, mask: torch.Tensor) -> mpm.Particles:
 
 
 def advance(solver: mpm.Solver, duration: float, push: tuple = (0.0, 0.0, 0.0), substeps: int | None = None) -> None:
-    """Advance a solver by `duration` [s] under one acceleration [m/s^2] for all particles."""
+    """Advance a solver by `duration` [s] with the same acceleration [m/s^2] for all particles."""
     solver.advance(duration, torch.tensor(push).repeat(len(solver.rows), 1), substeps)
 
 
 def pressure_pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, float, float]]:
-    """(time [s], position, theoretical position [m]) of a pressure pulse in a bar of Poisson ratio 0.
+    """(time [s], position, theoretical position [m]) of a pressure pulse in a bar with Poisson ratio 0.
 
-    `cells` are in the half width of the pulse. A pulse v = a g(x) with strain -a g(x) / c travels to the right only, at
-    c = sqrt(E / density).
+    `cells` is the number of cells in the half width of the pulse. A pulse v = a g(x) with strain -a g(x) / c travels to
+    the right only, at c = sqrt(E / density).
     """
     width, c = 0.1, math.sqrt(E / DENSITY)
     dx = width / cells
@@ -58,7 +59,7 @@ def pressure_pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, flo
     for n in range(9):
         v = (
             solver.particles.v[:, 0].double().clamp_min(0) ** 2
-        )  # squared, to weigh the peak and not ripples far from it
+        )  # squared, so that the peak outweighs ripples far from it
         rows.append((n * frame, float((v * start).sum() / v.sum()), 0.4 + c * n * frame))
         if n < 8:
             advance(solver, frame)
@@ -85,7 +86,7 @@ def bar_frequency(cells: int) -> tuple[float, float]:
 
 
 def cantilever_deflection(load: float, cells: int = 4) -> tuple[float, float]:
-    """Sag of the tip of a cantilever under gravity `load` [m/s^2], and Timoshenko's [m]; `cells` are in its height.
+    """Tip deflection of a cantilever under gravity `load` [m/s^2], and Timoshenko's [m]; `cells` are in its height.
 
     w = density g L^2 (L^2 / (2 h^2) 3 / E + 1 / (2 k G)), k = 5/6, G = E / 2: bending and shear.
     """
@@ -95,7 +96,7 @@ def cantilever_deflection(load: float, cells: int = 4) -> tuple[float, float]:
     p.held[p.x[:, 0] < 3 * dx] = 1
     tip = p.x[:, 0] > length + 3 * dx - dx
     solver, before, peak_energy = mpm.Solver(p, OPEN_BOX, dx), p.x[tip, 2].mean(), 0.0
-    for _ in range(120):  # stopped at each maximum of the kinetic energy, which is near equilibrium
+    for _ in range(120):  # kinetic damping: stop the motion at each maximum of the kinetic energy, near equilibrium
         advance(solver, 0.02, (0.0, 0.0, -load))
         energy = float(solver.particles.v.square().sum())
         if energy < peak_energy:
@@ -111,11 +112,11 @@ def cantilever_deflection(load: float, cells: int = 4) -> tuple[float, float]:
 def sand_column_spread(
     aspect: float, cells: int = 6, substeps: int | None = None, E: float = 3.5e5
 ) -> tuple[float, float]:
-    """Spread (r - r0) / r0 of a sand column of height aspect x r0 that collapses, and Lube et al. 2004: 1.24 aspect.
+    """Spread (r - r0) / r0 of a collapsing sand column of height aspect x r0, and Lube et al. 2004: 1.24 aspect.
 
-    `cells` are in its radius, `substeps` in 0.02 s (CFL by default); angle of repose 31 degrees, on a floor as rough.
-    Every transfer smooths a flow that is only some cells thick, so sand spreads less with larger cells and more
-    substeps.
+    `cells` is the number of cells in its radius, `substeps` that of substeps in 0.02 s (default: from the CFL
+    condition). The angle of repose is 31 degrees, on an equally rough floor. Every transfer smooths a flow that is only
+    a few cells thick, so sand spreads less with larger cells and more substeps.
     """
     r0 = 0.1
     dx = r0 / cells
@@ -132,7 +133,7 @@ def sand_column_spread(
 
 
 def bar_displacement(substeps: int, cells: int = 16) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions of a vibrating bar's particles after half a period in `substeps` steps, and at the start [m]."""
+    """Particle positions of a vibrating bar after half a period in `substeps` substeps, and at the start [m]."""
     length = 0.8
     dx = length / cells
     p = particle_block((length, 4 * dx, 4 * dx), dx / 2)
@@ -163,7 +164,7 @@ def momentum_drift(frames: int = 40, substeps: int = 250) -> list[tuple[int, flo
     r = p.x - p.x.mean(0)
     p.v = torch.tensor([0.2, -0.1, 0.1]) + torch.linalg.cross(torch.tensor([1.0, 2.0, -1.0]).expand_as(r), r) + r
     solver, rows = mpm.Solver(p, OPEN_BOX, dx), []
-    advance(solver, 0.01, substeps=substeps)  # to initialise the affine velocity matrices C
+    advance(solver, 0.01, substeps=substeps)  # initialises the affine velocity matrices C
     first = total_momenta(solver.particles, dx)
     for n in range(frames):
         advance(solver, 0.01, substeps=substeps)
@@ -173,7 +174,7 @@ def momentum_drift(frames: int = 40, substeps: int = 250) -> list[tuple[int, flo
 
 
 def total_momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Linear and angular momentum; a particle of APIC spins with inertia m dx^2 / 4 (Jiang et al. 2015, eq. 8)."""
+    """Linear and angular momentum; APIC particles have spin with inertia m dx^2 / 4 (Jiang et al. 2015, eq. 8)."""
     x, v, C, m = (t.double() for t in (p.x, p.v, p.C, p.mass))
     spin = dx**2 / 4 * torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
     return (m[:, None] * v).sum(0), (m[:, None] * (torch.linalg.cross(x, v) + spin)).sum(0)

@@ -1,1 +1,1 @@
-"""Small files of every format, damaged at random, and what their readers make of them."""
+"""Fuzzing of file readers: small valid files of every format, with random damage."""

@@ -1,4 +1,4 @@
-"""Many cases in a process of their own, which may crash, hang or take all memory: a report in JSON."""
+"""Runs many fuzzing cases in a separate process, which may crash, hang or exhaust memory, and writes a JSON report."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from stages.core.scene.files import ngff_version, replacing
 from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet, result_of
 
 RESULTS = (*GOOD, "nonsense", "traceback", "signal", "more than 10 s", "more than 2 GB")
-MAX_SECONDS = 10.0
-MAX_MEMORY = 2 << 30  # more than before the case [bytes]
-START = 120.0  # allowed to a process for imports and for writing the examples [s]
+MAX_SECONDS = 10.0  # time limit of a case
+MAX_MEMORY = 2 << 30  # limit on the memory growth of a case [bytes]
+START = 120.0  # time limit for a process to import modules and write the examples [s]
 
 
 def run(out: Path, count: int, seed: int = 0, minutes: float = math.inf) -> Iterator[str]:
-    """Run cases 0 to `count` - 1 of a seed and write OUT (.json); the files of failures go to OUT's folder NAME.cases.
+    """Run cases 0 to `count` - 1 of a seed and write OUT (.json); files of failures go to the folder NAME.cases.
 
-    After `minutes` no more cases begin; `count` of the report is the number of those that ran. Yields the lines of a
-    table. Raises InputError for a count below 1 and for no time.
+    No case starts after `minutes`; the report's `count` is the number of cases that ran. Yields the lines of a table.
+    Raises InputError for a count below 1 and for no time.
     """
     if count < 1:
         raise InputError(f"--count must be 1 or more, got {count}")
@@ -65,7 +65,7 @@ def run(out: Path, count: int, seed: int = 0, minutes: float = math.inf) -> Iter
 
 
 def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, str, str, Path]]:
-    """Number, kind, result, explanation and folder of each case, from processes that are started again as needed."""
+    """Number, kind, result, explanation and folder of each case, from worker processes restarted as needed."""
     context, number, failed = multiprocessing.get_context("spawn"), 0, 0
     while number < count:
         place = folder / f"process {failed}"
@@ -86,13 +86,13 @@ def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, st
                 if result.startswith("more than"):
                     break
                 ours.send("next")
-        except EOFError:  # the process has ended
+        except EOFError:  # the process has died
             process.join()
             files = Examples.place_in(place, number)
             yield number, files.name, "signal", f"exit status {process.exitcode}", files
             number += 1
         finally:
-            ours.close()  # at which it ends, unless it hangs
+            ours.close()  # makes the process exit, unless it hangs
             process.join(1)
             process.kill()
             process.join()
@@ -101,7 +101,7 @@ def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, st
 
 
 def _await_start(worker: Connection) -> None:
-    """Wait until the process that reads the files is ready. Raises InputError with what it says instead."""
+    """Wait until the worker process is ready. Raises InputError with its message if it is not."""
     answer = "has not started" if not worker.poll(START) else ""
     with suppress(EOFError):
         answer = answer or worker.recv()
@@ -110,18 +110,18 @@ def _await_start(worker: Connection) -> None:
 
 
 def _work(parent: Connection, folder: Path, seed: int, start: int, stop: int) -> None:
-    """Run cases and send the result of each; wait for an answer, so that its files are left as they are."""
+    """Run cases and send the result of each; wait for a reply, so that the files of the case can be copied first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries for images and videos write there
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # silences image and video libraries, which write to stderr
     try:
         examples = Examples(folder)
     except MissingPackage as error:
         parent.send(f"needs all packages: {error}")
         return
-    for kind in KINDS:  # libraries that are loaded below the limit may crash instead of saying that they lack memory
+    for kind in KINDS:  # load all libraries before the memory limit, under which loading may crash without a message
         result_of(kind, examples.place(kind))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (size + 2 * MAX_MEMORY,) * 2)  # the machine is not ours
+    resource.setrlimit(resource.RLIMIT_AS, (size + 2 * MAX_MEMORY,) * 2)  # protects other processes on the machine
     parent.send("ready")
     with quiet():
         for number in range(start, stop):

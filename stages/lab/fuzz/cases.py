@@ -1,8 +1,8 @@
-"""Cases: a random change of a small valid file, given to its reader.
+"""Fuzzing cases: a random change to a small valid file, given to its reader.
 
-The result is `right` (read, and the values satisfy their types), `clear error` (an InputError of one short line),
-`nonsense` (read, but the values do not, or an error that is not short) or `traceback` (any other exception). Those that
-only another process can see are in campaign.py.
+The result is `right` (read, with values that satisfy their types), `clear error` (an InputError with one short line),
+`nonsense` (read with invalid values, or an error that is too long or unprintable) or `traceback` (any other exception).
+Results that only another process can observe are in campaign.py.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.lab.fuzz.kinds import KINDS, Kind
 
-MAX_MESSAGE = 600  # characters of an error, without the path
-GOOD = ("right", "clear error")
-TURNS = [kind for kind in KINDS for _ in range(kind.share)]  # the kinds of the cases, repeated in this order
+MAX_MESSAGE = 600  # largest length of an error message without the path [characters]
+GOOD = ("right", "clear error")  # acceptable results
+TURNS = [kind for kind in KINDS for _ in range(kind.share)]  # kinds of the cases, used cyclically
 
 
 class Examples:
-    """The valid files of every kind, made once, in a folder; a case changes a copy."""
+    """The valid files of every kind, written once to a folder; each case changes a copy."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -37,7 +37,7 @@ class Examples:
             self.files[kind.name] = {path.name: path.read_bytes() for path in sorted(made.iterdir())}
 
     def place(self, kind: Kind) -> Path:
-        """A folder with the valid files of a kind."""
+        """Restore the valid files of a kind in the folder for its cases, and return it."""
         case = self.folder / "case" / kind.name
         case.mkdir(parents=True, exist_ok=True)
         for name, data in self.files[kind.name].items():
@@ -48,7 +48,7 @@ class Examples:
         return case
 
     def run(self, seed: int, number: int) -> tuple[Kind, str, str]:
-        """The kind and the result of a case, and what explains it; its files stay in `place_in`."""
+        """Run a case; return its kind, result and explanation. Its files stay in `place_in`."""
         kind, rng = TURNS[number % len(TURNS)], random.Random(f"{seed} {number}")
         case = self.place(kind)
         name = rng.choice(list(kind.changes))
@@ -59,12 +59,12 @@ class Examples:
 
     @staticmethod
     def place_in(folder: Path, number: int) -> Path:
-        """Where the examples of a folder have the files of a case, until the next case of its kind."""
+        """The folder with the files of a case, valid until the next case of the same kind."""
         return folder / "case" / TURNS[number % len(TURNS)].name
 
 
 def result_of(kind: Kind, folder: Path) -> tuple[str, str]:
-    """The result of reading the files in a folder, and what explains it."""
+    """Result and explanation of reading the files in a folder."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -84,7 +84,7 @@ def result_of(kind: Kind, folder: Path) -> tuple[str, str]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without log messages."""
+    """Suppress log messages."""
     logging.disable(logging.CRITICAL)
     try:
         yield

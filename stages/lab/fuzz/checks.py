@@ -1,4 +1,4 @@
-"""Whether what a reader returns satisfies its types: AssertionError where it does not."""
+"""Checks that the values returned by readers satisfy their types; each raises AssertionError otherwise."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_trajectory(t: Trajectory) -> None:
 
 
 def check_lenses(found: tuple[Cameras, LensDistortion]) -> None:
-    """AssertionError unless cameras are rigid and finite, and so their lenses."""
+    """AssertionError unless cameras are rigid and finite, and lens coefficients finite."""
     check_cameras_of(found[0])
     assert found[1].coefficients.isfinite().all() and found[1].coefficients.abs().max() < 1e10, "lens"
 
@@ -76,7 +76,7 @@ def check_forces(forces: Sequence[Force]) -> None:
 
 
 def check_force_prompts(prompts: ForcePrompts) -> None:
-    """AssertionError unless all that a user may ask of a simulation is finite."""
+    """AssertionError unless all prompts of a simulation are finite and refer to known objects."""
     check_forces(prompts.forces)
     assert all(abs(x) < 1e10 for v in prompts.velocity.values() for x in v), "velocity"
     assert all(abs(x) < 1e10 for x in prompts.lift.values()), "lift"
@@ -93,7 +93,7 @@ def check_simulate_options(options: SimulateOptions) -> None:
 
 
 def check_materials(found: dict[int, MaterialChoice]) -> None:
-    """AssertionError unless each object has elastic solids as its materials."""
+    """AssertionError unless all materials have values in a plausible range."""
     for part in (part for choice in found.values() for part in choice.parts):
         m = part.material
         assert 1e-4 < m.E < 1e14 and 1e-4 < m.density < 1e6 and -0.5 < m.nu < 0.5 and 0 <= m.friction < 1e3, "material"
@@ -108,28 +108,28 @@ def check_prompts(p: ObjectPrompts) -> None:
 
 
 def check_names(names: dict[int, object]) -> None:
-    """AssertionError unless labels are those of a label image, and names are text."""
+    """AssertionError unless numbers are valid labels and names are printable text."""
     assert all(isinstance(i, int) and 0 <= i < 1 << 16 for i in names), "labels"
     texts = [getattr(name, "name", name) for name in names.values()]
     assert all(text.isprintable() and len(text) <= 200 for text in texts), "text"
 
 
 def check_configs(configs: dict[str, SceneConfig]) -> None:
-    """AssertionError unless scenes have objects with finite places and positive scales."""
+    """AssertionError unless scenes have objects with finite positions and positive scales."""
     for c in configs.values():
         assert len(c.ids) == len(c.translation) == len(c.scale) > 0 and min(c.ids) >= 0 < min(c.scale), "lengths"
         assert all(abs(x) < 1e6 for p in (*c.translation, c.scale) for x in p) and "/" not in c.name, "values"
 
 
 def check_parameters(model: torch.nn.Module) -> None:
-    """AssertionError unless all parameters are there and finite, in single precision."""
+    """AssertionError unless all parameters are finite, on the CPU and in single precision."""
     for p in (*model.parameters(), *model.buffers()):
         assert p.device.type == "cpu" and (not p.is_floating_point() or p.dtype == torch.float32), "type"
         assert p.isfinite().all(), "not finite"
 
 
 def check_motions(m: KeypointMotions) -> None:
-    """AssertionError unless the shapes of motions agree, and all is finite."""
+    """AssertionError unless shapes agree and all values are finite."""
     s, t, o, n, _ = m.points.shape
     assert s and t and o and n and len(m.names) == s and m.objects.shape == (s, o), "shapes"
     for name in ("mass", "E", "nu", "friction", "solidity"):
@@ -146,7 +146,7 @@ def check_images(images: Iterable[torch.Tensor]) -> None:
 
 
 def check_labelled(scene: Scene) -> None:
-    """AssertionError unless a scene with labels satisfies its types, and its objects have Gaussians of their id."""
+    """AssertionError unless a labelled scene satisfies its types and lists an object for each id of its Gaussians."""
     check_scene(scene)
     assert {o.id for o in scene.objects} >= set(scene.gaussians.object_id.unique().tolist()) - {0}, "objects"
 
@@ -164,13 +164,13 @@ def check_points(x: torch.Tensor) -> None:
 
 
 def check_answers(answers: Answers) -> None:
-    """AssertionError unless ratings are points of the scale, or none."""
+    """AssertionError unless ratings are on the scale, or 0 for none."""
     for table in answers.ratings.values():
         assert table.shape == (1, len(answers.films)) and table.min() >= 0 and table.max() <= answers.points, "ratings"
 
 
 def check_sums(sums: dict[str, str]) -> None:
-    """AssertionError unless digests have their length."""
+    """AssertionError unless digests have the right length."""
     assert all(len(digest) == 64 for digest in sums.values()), "digests"
 
 

@@ -1,4 +1,4 @@
-"""Small valid files of every format that ngff reads: writers, and the values that they store."""
+"""Small valid files of every format that ngff reads: functions that write them, and values stored in them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ OBJECTS = example_scene().objects
 
 
 def write_trajectory(path: Path) -> None:
-    """Three frames of twelve keypoints."""
+    """A trajectory with three frames of twelve keypoints."""
     scene = example_scene()
     n, rest = len(scene.gaussians), torch.randn(12, 3, generator=torch.Generator().manual_seed(1))
     binding = Binding(torch.arange(n)[:, None] % 12, torch.ones(n, 1))
@@ -80,14 +80,14 @@ def write_trajectory(path: Path) -> None:
 
 
 def write_transforms(path: Path) -> None:
-    """A transforms.json of two frames."""
+    """A transforms.json with two frames."""
     frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
     path.write_text(json.dumps({"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24, "k1": 0.1,
                                 "frames": frames}))  # fmt: skip
 
 
 def write_packed(path: Path) -> None:
-    """Sixty Gaussians in the layout of PlayCanvas: 11, 10 and 11 bits between the bounds of a chunk."""
+    """Sixty Gaussians in PlayCanvas's compressed PLY layout: 11, 10 and 11 bits between the bounds of a chunk."""
     rng = np.random.default_rng(0)
     words = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
     vertices = np.zeros(60, [(name, "<u4") for name in words])
@@ -102,13 +102,13 @@ def write_packed(path: Path) -> None:
 
 
 def write_colmap(folder: Path) -> None:
-    """Two images of one camera, as text and in binary form."""
+    """A COLMAP model with two images of one camera, as text and as binary files."""
     poses = [(0.8, 0.1, -0.3, 0.5, 1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)]
     camera = (40.0, 41.0, 16.0, 12.0, 0.1, -0.02, 0.001, 0.002)
     lines = [f"{i + 1} {' '.join(map(str, pose))} 1 {'ab'[i]}.png\n1.0 2.0 -1" for i, pose in enumerate(poses)]
     (folder / "images.txt").write_text("# images\n" + "\n".join(lines) + "\n")
     (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 32 24 " + " ".join(map(str, camera)) + "\n")
-    pack = np.array  # of little-endian values
+    pack = np.array  # with little-endian types
     count, none = pack([2], "<u8").tobytes(), pack([0], "<u8").tobytes()
     rows = [pack([i + 1], "<u4").tobytes() + pack(pose, "<f8").tobytes() + pack([1], "<u4").tobytes()
             + f"{'ab'[i]}.png".encode() + b"\0" + none for i, pose in enumerate(poses)]  # fmt: skip
@@ -118,20 +118,20 @@ def write_colmap(folder: Path) -> None:
 
 
 def write_colmap_text(folder: Path) -> None:
-    """The same as text only."""
+    """The same COLMAP model, as text files only."""
     write_colmap(folder)
     for name in ("images.bin", "cameras.bin"):
         (folder / name).unlink()
 
 
 def write_weights(folder: Path) -> None:
-    """A small untrained model with its card."""
+    """Weights of a small untrained model, with their card."""
     torch.manual_seed(0)
     checkpoints.save(folder / "w.safetensors", "gcn", checkpoints.build("gcn", hidden=4, layers=2))
 
 
 def repair_card(folder: Path, name: str = "w") -> None:
-    """State the sha256 that the changed weights have."""
+    """Update the sha256 in the card to that of the changed weights."""
     try:
         card = json.loads((folder / f"{name}.json").read_text())
         card["sha256"] = sha256(folder / f"{name}.safetensors")
@@ -141,7 +141,7 @@ def repair_card(folder: Path, name: str = "w") -> None:
 
 
 def write_segmenter(folder: Path) -> None:
-    """A small untrained segmentation network with its card."""
+    """Weights of a small untrained segmentation network, with their card."""
     torch.manual_seed(0)
     model = Segmenter((4, 6), 1)
     save_file({name: value.half() for name, value in model.state_dict().items()}, folder / "w.safetensors")
@@ -150,21 +150,21 @@ def write_segmenter(folder: Path) -> None:
 
 
 def write_clutter(path: Path) -> None:
-    """An example of clutter: six surfels."""
+    """A clutter example with six surfels."""
     points = ScenePoints(*(torch.rand(6, 3)[:, 0] if name == "flatness" else torch.rand(6, 3) for name in
                            ScenePoints.__dataclass_fields__))  # fmt: skip
     write_example(path, Example(points, torch.arange(6) - 1))
 
 
 def write_masks(folder: Path) -> None:
-    """Label images of two photos, and the names of what they show."""
+    """Label images of two photos, and the names of the objects in them."""
     for name in "ab":
         write_labels(folder / f"{name}.png", torch.arange(768).reshape(24, 32) % 3)
     (folder / "names.json").write_text(json.dumps({"1": "duck", "2": {"name": "bowl"}}))
 
 
 def write_study(folder: Path) -> None:
-    """The key of a study of two films, and the answers of a participant."""
+    """The key of a study with two films, and the answers of one participant."""
     films = {name: {"model": "ngff", "split": split, "file": "a.mp4"} for name, split in (("f1", "a"), ("f2", ""))}
     shown, scales = {"1": ["f1", "f2"], "2": ["f2"]}, ["PhysR", "PhotoR"]
     key = {"study": "abc", "films": films, "participants": shown, "points": 5, "scales": scales}
@@ -174,30 +174,30 @@ def write_study(folder: Path) -> None:
 
 
 def write_frame(path: Path) -> None:
-    """A frame of the published simulations."""
+    """A frame in the format of the published simulations."""
     with h5py.File(path, "w") as file:
         file["x"], file.attrs["step"] = np.ones((5, 3), "f4"), 0
 
 
 def write_sums(path: Path) -> None:
-    """A list of digests."""
+    """A list of sha256 digests."""
     path.write_text(f"{'0' * 64}  objects/ball.ply\n{'f' * 64}  scenes/a b.h5\n")
 
 
 def write_checkpoint(folder: Path) -> None:
-    """A checkpoint of the public code."""
+    """A checkpoint in the format of the public code."""
     torch.save(checkpoints.build("ngff-paper", hidden=2, layers=1).state_dict(), folder / "w.pt")
 
 
 def write_recording(path: Path) -> None:
-    """Two frames of three particles in two bodies."""
+    """A recording with two frames of three particles in two bodies."""
     np.savez(path, positions=np.ones((2, 3, 3), "f4"), n=np.array([1, 2]), volume=np.full(3, 1e-5), E=np.full(2, 1e5),
              rho=np.full(2, 500.0), nu=0.3, dt=1e-4, substeps_per_frame=20, n_grid=20, grid_lim=2.0,
              gravity=np.array([0, 0, -9.8]), rpic_damping=0.1)  # fmt: skip
 
 
 def example_motions(folder: Path) -> None:
-    """Two scenes, of one and of two objects with four keypoints, over three frames."""
+    """Motions of two scenes, with one and two objects of four keypoints each, over three frames."""
     one, generator = torch.ones(2, 2), torch.Generator().manual_seed(0)
     motions = KeypointMotions(
         ("0_1_2", "1_4"), torch.tensor([[1, 2], [4, -1]]), torch.rand(2, 3, 2, 4, 3, generator=generator), 0.1 * one,
@@ -207,14 +207,14 @@ def example_motions(folder: Path) -> None:
 
 
 def write_video(folder: Path) -> None:
-    """Four frames of 32 x 24 pixels."""
+    """A video with four frames of 32 x 24 pixels."""
     with VideoWriter(folder / "v.mp4", 25.0) as video:
         for frame in torch.rand(4, 24, 32, 3, generator=torch.Generator().manual_seed(0)):
             video.append(frame)
 
 
 def write_photos(folder: Path) -> None:
-    """Two photos, of different formats."""
+    """The same image as a photo in several formats."""
     image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
     write_png(folder / "a.png", image)
     import cv2
@@ -224,12 +224,12 @@ def write_photos(folder: Path) -> None:
 
 
 def as_json(name: str, value: object) -> Callable[[Path], None]:
-    """A writer of one JSON file."""
+    """A function that writes a value to a JSON file NAME in a folder."""
     return lambda folder: (folder / name).write_text(json.dumps(value))
 
 
 def as_text(value: object) -> Callable[[Path], object]:
-    """A writer of a JSON file of any name."""
+    """A function that writes a value to a JSON file at any path."""
     return lambda path: path.write_text(json.dumps(value))
 
 

@@ -88,18 +88,18 @@ Change = Callable[[Path, random.Random], None]
 
 @dataclass(frozen=True)
 class Kind:
-    """A format under test: a folder with a small valid example, which files change and how, and the reader."""
+    """A format under test: how to write a small valid example, which files are changed and how, and the reader."""
 
     name: str
-    write: Callable[[Path], object]  # into a folder
-    changes: Mapping[str, Change]  # one of these files is changed
-    read: Callable[[Path], object]  # from the folder; AssertionError for nonsense
-    share: int = 1  # of the cases, relative to the others
-    repair: Callable[[Path], object] | None = None  # corrects the checksums, in half of the cases
+    write: Callable[[Path], object]  # writes the example to a folder
+    changes: Mapping[str, Change]  # by file name; one of the files is changed per case
+    read: Callable[[Path], object]  # reads from the folder; raises AssertionError for invalid values
+    share: int = 1  # relative frequency of its cases
+    repair: Callable[[Path], object] | None = None  # corrects checksums, in 70 % of the cases
 
 
 def read_message(path: Path) -> None:
-    """A message of a live page; one that is refused is no error of the server."""
+    """Read a message of a live page; a rejected message is not an error of the server."""
     try:
         checks.check_message(parse_message(path.read_text(errors="replace")))
     except BadMessage as error:
@@ -107,12 +107,12 @@ def read_message(path: Path) -> None:
 
 
 def read_masks(folder: Path) -> None:
-    """The label images of a folder, through the first stage of `segment --masks`."""
+    """Read the label images of a folder, as the first step of `segment --masks` does."""
     checks.check_labelled(segment_masks(example_scene(), SegmentOptions(masks=folder)))
 
 
 def read_options(folder: Path) -> None:
-    """The options --force --velocity --lift --pin --material of `ngff simulate`, one in a line."""
+    """Read the options --force --velocity --lift --pin --material of `ngff simulate`, one per line."""
     lines = [*(folder / "options").read_text(errors="replace").split("\n"), *[""] * 5]
     force, velocity, lift, pin, material = ([line] if line else [] for line in lines[:5])
     checks.check_force_prompts(parse(OBJECTS, force=force, velocity=velocity, lift=lift, pin=pin))
@@ -120,36 +120,36 @@ def read_options(folder: Path) -> None:
 
 
 def check_trajectory_and_prompts(folder: Path) -> None:
-    """A trajectory, and its prompts and options as --forces reads them."""
+    """Read and check a trajectory, and the prompts and options that --forces would take from it."""
     found = read_trajectory(folder / "traj.h5")
     checks.check_trajectory(found)
     check_recording(folder / "traj.h5")
 
 
 def check_recording(path: Path) -> None:
-    """The prompts and options that --forces takes from a file."""
+    """Read and check the prompts and options that --forces takes from a file."""
     checks.check_force_prompts(read_prompts_file(path, "scene", OBJECTS))
     checks.check_simulate_options(with_recorded(SimulateOptions(forces=path)))
 
 
 def check_video(folder: Path) -> None:
-    """The frames of a video as images, and as photos."""
+    """Read and check the frames of a video, as images and as photos."""
     checks.check_images(read_video(folder / "v.mp4"))
     checks.check_images(image for image in read_photos(folder / "v.mp4").images)
 
 
 def single(read: Callable, name: str, check: Callable) -> Callable[[Path], None]:
-    """A reader of one file of the folder, with a check of what it returns."""
+    """A function that reads one file of a folder and checks what the reader returns."""
     return lambda folder: check(read(folder / name))
 
 
 def file_kind(name: str, write: Callable, change: Change, read: Callable, check: Callable, share: int = 1) -> Kind:
-    """A kind of a single file."""
+    """A kind with a single file."""
     return Kind(name, lambda folder: write(folder / name), {name: change}, single(read, name, check), share)
 
 
 def json_kind(name: str, value: object, read: Callable, check: Callable) -> Kind:
-    """A kind of a single JSON file, of which a reader gets the path."""
+    """A kind with a single JSON file, whose reader receives the path."""
     return Kind(name, as_json(name, value), {name: change_json}, single(read, name, check))
 
 

@@ -1,4 +1,4 @@
-"""Random changes of files: of bytes, words, JSON values, and of the values and types of binary formats."""
+"""Random changes to files: to bytes, words, JSON values, and values and types in binary formats."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+# replacement values for numbers, for any JSON value, and for words in text
 NUMBERS = [0, 1, 2, 0.5, -1, 1e-40, 1e20, 1e300, 10**12, 2**31 - 1, 2**31, 2**64, float("nan"), float("inf"),
            -float("inf")]  # fmt: skip
 VALUES = [*NUMBERS, None, True, "abc", "", "\x1b[31m\n", "<script>", "../x", "x" * 5000, [], {}, [[]], [1, 2], {"a": 1}]
@@ -20,7 +21,7 @@ WORDS = [b"nan", b"inf", b"1000000000000", b"18446744073709551616", b"-1", b"lis
 
 
 def change_bytes(path: Path, rng: random.Random) -> None:
-    """Flip, cut, insert or repeat bytes, most often in the first two thousand, where headers are."""
+    """Change, delete, insert, repeat or truncate bytes, mostly among the first 2000, which contain headers."""
     data = bytearray(path.read_bytes())
     for _ in range(rng.choice([1, 1, 2, 5])):
         if not data:
@@ -42,7 +43,7 @@ def change_bytes(path: Path, rng: random.Random) -> None:
 
 
 def change_words(path: Path, rng: random.Random) -> None:
-    """Replace a word of the text (of a PLY: of its header), or a few bytes."""
+    """Replace a word of the text (in a PLY: of its header), or change a few bytes."""
     if rng.random() < 0.4:
         return change_bytes(path, rng)
     head, mark, body = path.read_bytes().partition(b"end_header\n")
@@ -56,7 +57,7 @@ def change_words(path: Path, rng: random.Random) -> None:
 
 
 def change_vertices(path: Path, rng: random.Random) -> None:
-    """A value of the properties of a PLY, or of the JSON in its comments, or its text."""
+    """Change a value of a PLY's properties, a value of the JSON in its comments, or its text."""
     head, mark, body = path.read_bytes().partition(b"end_header\n")
     lines = head.decode().split("\n")
     comments = [i for i, line in enumerate(lines) if line.startswith("comment ngff:")]
@@ -73,14 +74,14 @@ def change_vertices(path: Path, rng: random.Random) -> None:
 
 
 def change_json(path: Path, rng: random.Random) -> None:
-    """Replace, remove or wrap a value somewhere in a JSON file, or change its bytes."""
+    """Replace, remove or wrap a random value in a JSON file, or change its bytes."""
     if rng.random() < 0.3:
         return change_words(path, rng)
     path.write_text(_other_json(path.read_text(), rng))
 
 
 def _other_json(text: str, rng: random.Random) -> str:
-    """A JSON text with a value somewhere replaced, by another of its own or by one of VALUES, removed or wrapped."""
+    """A JSON text with a random value removed, wrapped, or replaced by another of its values or by one of VALUES."""
     data = [json.loads(text)]
     places = list(_places(data))
     parent, key = rng.choice(places[1:] or places)
@@ -100,7 +101,7 @@ def _places(data: object) -> Iterator[tuple]:
 
 
 def change_datasets(path: Path, rng: random.Random) -> None:
-    """Another value, type, shape or kind of an attribute or object of an HDF5 file, or its bytes."""
+    """Change value, type, shape or kind of an attribute or object of an HDF5 file, or its bytes."""
     if rng.random() < 0.15:
         return change_bytes(path, rng)
     with h5py.File(path, "a") as file:
@@ -150,7 +151,7 @@ def change_datasets(path: Path, rng: random.Random) -> None:
 
 
 def change_doubles(path: Path, rng: random.Random) -> None:
-    """A 32- or 64-bit number at any byte, or the bytes."""
+    """Overwrite a 32- or 64-bit number at a random position, or change bytes."""
     data = bytearray(path.read_bytes())
     if rng.random() < 0.4 or len(data) < 16:
         return change_bytes(path, rng)
@@ -167,7 +168,7 @@ def change_doubles(path: Path, rng: random.Random) -> None:
 
 
 def change_tensors(path: Path, rng: random.Random) -> None:
-    """The header or the values of a .safetensors file, or its bytes."""
+    """Change the header or the values of a .safetensors file, or its bytes."""
     if rng.random() < 0.3:
         return change_bytes(path, rng)
     data = path.read_bytes()
@@ -182,7 +183,7 @@ def change_tensors(path: Path, rng: random.Random) -> None:
 
 
 def change_arrays(path: Path, rng: random.Random) -> None:
-    """A value, type or shape of an array of an NPZ file, or its bytes."""
+    """Change a value, type or shape of an array in an NPZ file, or its bytes."""
     if rng.random() < 0.3:
         return change_bytes(path, rng)
     with np.load(path) as file:
@@ -209,7 +210,7 @@ def change_arrays(path: Path, rng: random.Random) -> None:
 
 
 def _other_floats(body: bytes, rng: random.Random) -> bytes:
-    """The bytes of 32-bit floats with one, every seventh, or all from some place on, replaced."""
+    """The bytes of 32-bit floats with one value, every seventh, or all replaced, from a random position on."""
     values = np.frombuffer(body[: len(body) // 4 * 4], "<f4").copy()
     with np.errstate(over="ignore"):
         values[rng.randrange(len(values)) :: rng.choice([1, 7, len(values)])] = np.float32(rng.choice(NUMBERS))

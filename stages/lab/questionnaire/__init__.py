@@ -1,1 +1,1 @@
-"""Questionnaire on films: pages for participants, and the table of their answers."""
+"""Questionnaire on films: pages for participants, and evaluation of their answers."""

@@ -1,4 +1,4 @@
-"""Krippendorff's alpha: agreement of several raters who each rated some of the units.
+"""Krippendorff's alpha: agreement of several raters who each rated only some of the units.
 
 Source: Krippendorff 2011, "Computing Krippendorff's Alpha-Reliability".
 """
@@ -9,10 +9,10 @@ import numpy as np
 
 
 def coincidences(ratings: np.ndarray, points: int) -> np.ndarray:
-    """Coincidence matrix of each unit, (units, points, points), of ratings 1 to `points`, (raters, units), 0 for none.
+    """Coincidence matrix of each unit, (units, points, points), from ratings 1 to `points` (raters, units), 0: none.
 
-    A unit with m ratings contributes each of its m (m - 1) ordered pairs with the weight 1 / (m - 1); a unit with a
-    single rating contributes nothing.
+    A unit with m ratings contributes each of its m (m - 1) ordered pairs with weight 1 / (m - 1); a unit with a single
+    rating contributes nothing.
     """
     counts = np.stack([(ratings == k).sum(0) for k in range(1, points + 1)], 1).astype(float)
     pairs = counts[:, :, None] * counts[:, None, :] - np.eye(points) * counts[:, :, None]
@@ -20,10 +20,10 @@ def coincidences(ratings: np.ndarray, points: int) -> np.ndarray:
 
 
 def krippendorff_alpha(pairs: np.ndarray, ordinal: bool) -> np.ndarray:
-    """Alpha of summed coincidence matrices, (..., points, points): 1 is agreement, 0 what chance gives.
+    """Alpha of summed coincidence matrices (..., points, points): 1 is agreement, 0 is expected by chance.
 
-    The difference of two ratings is that of their numbers, or if `ordinal` that of their mean ranks among all ratings.
-    nan where fewer than two different ratings were given.
+    The difference of two ratings is that of their values, or, if `ordinal`, that of their mean ranks among all ratings.
+    nan if fewer than two different ratings were given.
     """
     n = pairs.sum(-1)
     position = n.cumsum(-1) - n / 2 if ordinal else np.broadcast_to(np.arange(n.shape[-1], dtype=float), n.shape)

@@ -1,4 +1,4 @@
-"""Answers of participants, and the table of them: distributions, means with intervals, and agreement."""
+"""Evaluation of the answers of participants: distributions, means with intervals, and agreement."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from stages.core.scene.schema import quote, reason, text, texts, whole
 from stages.evaluate.result import format_number
 from stages.lab.questionnaire.agreement import coincidences, krippendorff_alpha
 
-DRAWS, LEVEL = 2000, 95  # bootstrap samples; level of the intervals [%]
+DRAWS, LEVEL = 2000, 95  # number of bootstrap samples, and level of the intervals [%]
 
 
 class Answers(NamedTuple):
-    """Ratings of a study."""
+    """The ratings of a study."""
 
     ratings: dict[str, np.ndarray]  # by scale: (participants, films), 1 to `points`, 0 for none
-    films: dict[str, dict]  # model, split and file of each film, in the order of the columns
+    films: dict[str, dict]  # model, split and file of each film, in column order
     points: int
-    missing: int  # films that were shown in the pages of these participants and have no answer
-    unplayable: int
+    missing: int  # number of films shown on the pages of these participants but not answered
+    unplayable: int  # number of films that could not be played
 
 
 def run(study: Path, files: Sequence[Path], out: Path | None, seed: int = 0) -> list[str]:
-    """The table of answers as lines of text, and as JSON in `out`. `files` are answers and folders of them."""
+    """Evaluate answers; return a table as lines of text and write JSON to `out`. `files` may contain folders."""
     paths = find_answers(files)
     answers = read_answers(Path(study), paths)
     rows = {group: {scale: _summary(answers, scale, columns, seed) for scale in answers.ratings}
@@ -45,7 +45,7 @@ def run(study: Path, files: Sequence[Path], out: Path | None, seed: int = 0) -> 
 
 
 def find_answers(paths: Sequence[Path]) -> list[Path]:
-    """The files among the paths, and the JSON files of folders among them."""
+    """The given files, and the JSON files in the given folders. Raises InputError for a folder without any."""
     found = []
     for path in map(Path, paths):
         inside = sorted(path.glob("*.json")) if path.is_dir() else [path]
@@ -56,7 +56,7 @@ def find_answers(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
-    """The answers in the files. Raises InputError for files of another study, and for two of one participant."""
+    """Read answer files. Raises InputError for files of another study, and for two files of one participant."""
     key = _read_key(study / "key.json")
     films, participants, points, scales = (key[name] for name in ("films", "participants", "points", "scales"))
     column = {film: i for i, film in enumerate(films)}
@@ -84,7 +84,7 @@ def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
 
 
 def _read_key(path: Path) -> dict:
-    """The key of a study: its name, films, the films that each participant is shown, the scales and their points."""
+    """The key of a study: its name, films, the films shown to each participant, and the scales with their points."""
     what = "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes"
     key = read_json_file(path, what)
     try:
@@ -100,7 +100,7 @@ def _read_key(path: Path) -> dict:
 
 
 def _checked(data: dict, shown: list[str], scales: list[str], points: int) -> tuple[dict[str, list[int]], int]:
-    """The ratings of each film, and the number of films that could not be played."""
+    """The ratings of each film, and the number of films that could not be played. Raises ValueError if invalid."""
     rated, skipped = {}, set()
     for answer in data["answers"]:
         film = answer["film"]
@@ -114,7 +114,7 @@ def _checked(data: dict, shown: list[str], scales: list[str], points: int) -> tu
 
 
 def _groups(films: dict[str, dict]) -> dict[str, np.ndarray]:
-    """Columns of each model and split, of each model with several splits, and of all films."""
+    """Column masks of each model and split, of each model with several splits, and of all films."""
     names = [(film["model"], film["split"]) for film in films.values()]
     groups: dict[str, list[bool]] = {}
     for model in dict.fromkeys(model for model, _ in names):
@@ -129,8 +129,8 @@ def _groups(films: dict[str, dict]) -> dict[str, np.ndarray]:
 def _summary(answers: Answers, scale: str, columns: np.ndarray, seed: int) -> dict:
     """Counts of each answer, and the mean score in 0..1 with its bootstrap interval, over some films.
 
-    Participants and films are drawn independently (Owen 2007, "The pigeonhole bootstrap"): both are samples of what
-    there could be, and ratings by one participant or of one film are not independent.
+    Participants and films are resampled independently (Owen 2007, "The pigeonhole bootstrap"): both are samples of
+    larger populations, and ratings by one participant or of one film are not independent.
     """
     ratings = answers.ratings[scale][:, columns]
     given = ratings > 0
@@ -146,7 +146,7 @@ def _summary(answers: Answers, scale: str, columns: np.ndarray, seed: int) -> di
 
 
 def _agreement(ratings: np.ndarray, points: int, seed: int) -> dict:
-    """Krippendorff's alpha with its interval; films are drawn for it (Zapf et al. 2016)."""
+    """Krippendorff's alpha with its bootstrap interval, for which films are resampled (Zapf et al. 2016)."""
     pairs = coincidences(ratings, points)
     units = len(pairs)
     draws = np.random.default_rng(seed).multinomial(units, np.full(units, 1 / units), DRAWS)
@@ -159,7 +159,7 @@ def _agreement(ratings: np.ndarray, points: int, seed: int) -> dict:
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
-    """Percentiles of the draws that gave a number."""
+    """Percentiles of the finite bootstrap values; nan if there are none."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return float("nan"), float("nan")
@@ -169,7 +169,7 @@ def _interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def _table(rows: dict, agreement: dict, answers: Answers, participants: int) -> list[str]:
-    """Lines of text."""
+    """The results as lines of text."""
     lines, width = [], max(map(len, rows))
     head = " ".join(f"{k:>5}" for k in range(1, answers.points + 1))
     for scale in agreement:

@@ -1,4 +1,4 @@
-"""Which participant sees which films, and in which order."""
+"""Assignment of films to participants, and their order."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 
 def assign_films(cells: Sequence[str], participants: int, films: int, seed: int) -> list[list[int]]:
-    """For each participant the numbers of the films to show, in order.
+    """For each participant, the indices of the films to show, in order.
 
-    `cells` is the cell (model and split) of each film. Each participant sees as many films of one cell as of another,
-    or one more, as long as the cell has films; over all participants the cells, and the films of a cell, are shown
-    equally often. Orders are random.
+    `cells` holds the cell (model and split) of each film. A participant sees equally many films of each cell, or one
+    more, as long as the cell has films. Over all participants, cells, and films within a cell, are shown equally often.
+    Orders are random.
     """
     rng, shown, total = random.Random(seed), [0] * len(cells), Counter()
     orders = []

@@ -1,4 +1,4 @@
-"""A study: pages for participants, the films that they show, and the key that maps each film to its model."""
+"""Creation of a study: pages for participants, their films, and the key that maps each film to its model."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from stages.lab.questionnaire.options import StudyOptions
 
 log = logging.getLogger(__name__)
 WEB = Path(__file__).parent / "web"
-POINTS = 5  # of both scales
-SCALES = {  # name in tables: the question, what it means, and what the lowest and the highest answer mean
+POINTS = 5  # number of points of both scales
+SCALES = {  # name in tables: question, explanation, and meaning of the lowest and the highest answer
     "PhysR": ("Do the objects move as real ones would?",
               "Think of falling, support, collisions, bouncing, sliding and bending, and of whether objects keep their "
               "number, shape and size.", "not at all", "exactly"),
@@ -33,10 +33,10 @@ SCALES = {  # name in tables: the question, what it means, and what the lowest a
 
 
 def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
-    """FOLDER/MODEL/SPLIT/*.mp4 or FOLDER/MODEL/*.mp4 -> OUT/key.json and OUT/pages/; a line about what was written.
+    """FOLDER/MODEL/SPLIT/*.mp4 or FOLDER/MODEL/*.mp4 -> OUT/key.json and OUT/pages/; returns lines about the result.
 
-    The films are encoded anew, without sound and titles, under names that do not reveal their origin. Raises
-    InputError for a folder without films, films that cannot be read, and an output folder that has a study already.
+    Films are re-encoded without sound and metadata, under names that do not reveal their origin. Raises InputError for
+    a folder without films, unreadable films, and an output folder that already has a study.
     """
     folder, out = Path(folder), Path(out)
     if (out / "key.json").exists():
@@ -66,7 +66,7 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
     for participant, shown in participants.items():
         with replacing(pages / f"{participant}.html") as part:
             part.write_text(_page(study, participant, shown), encoding="utf-8")
-    with replacing(out / "key.json") as part:  # last: a study with a key is complete
+    with replacing(out / "key.json") as part:  # written last: a study with a key is complete
         info = {"study": study, **content, "provenance": provenance("questionnaire", [folder], options)}
         part.write_text(json.dumps(info, indent=1) + "\n")
     shown = min(options.films, len(ids))
@@ -76,7 +76,7 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
 
 
 def find_cells(folder: Path) -> dict[Path, tuple[Path, str, str]]:
-    """The films below FOLDER/MODEL/SPLIT or FOLDER/MODEL: (film, model, split, "" where there is none)."""
+    """The films below FOLDER/MODEL/SPLIT or FOLDER/MODEL as (film, model, split); split is "" if there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give one that holds a folder of films for each model")
     films = {}
@@ -91,7 +91,7 @@ def find_cells(folder: Path) -> dict[Path, tuple[Path, str, str]]:
 
 
 def _encode(film: Path, out: Path) -> float:
-    """Encode a film as any browser plays it, and return its duration [s]; what it says about its origin is lost."""
+    """Re-encode a film for browsers, without metadata that reveals its origin; return its duration [s]."""
     fps = video_info(film)[1] or 25.0
     frames = 0
     with VideoWriter(out, fps) as video:

@@ -1,1 +1,1 @@
-"""Textbook experiments for the engines of `ngff simulate`."""
+"""Textbook physics experiments for the engines of `ngff simulate`."""

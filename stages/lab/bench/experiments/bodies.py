@@ -1,4 +1,4 @@
-"""Bodies and scenes of the experiments: closed surfaces of Gaussians, as a perfect reconstruction would give them."""
+"""Bodies and scenes of the experiments: closed surfaces of Gaussians, as from a perfect reconstruction."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Specimen:
     surface: Surface
     E: float = 1e7  # [Pa]
     density: float = 540.0  # [kg/m^3]
-    loss: float = 0.15
+    loss: float = 0.15  # loss factor
 
     def material(self) -> dict:
         """The material in the form that `ngff simulate --materials` reads."""
@@ -31,13 +31,13 @@ class Specimen:
 
 @dataclass(frozen=True)
 class Run:
-    """A scene in metres with its floor at z = 0, and options of `ngff simulate` that are not the default."""
+    """A scene in metres with its floor at z = 0, and non-default options of `ngff simulate`."""
 
     bodies: tuple[Specimen, ...]
     options: Mapping = field(default_factory=dict)
 
     def scene(self) -> Scene:
-        """The scene with the bodies as objects 1, 2, ..., of grey Gaussians."""
+        """The scene with the bodies as objects 1, 2, ..., made of grey Gaussians."""
         parts = [to_gaussians(t.surface, torch.full((len(t.surface.points), 3), 0.5), i + 1, widest=math.inf)
                  for i, t in enumerate(self.bodies)]  # fmt: skip
         objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
@@ -45,23 +45,23 @@ class Run:
 
 
 def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Specimen:
-    """A cube of this side [m] over (x, 0), its lower face at the height `bottom` [m]."""
+    """A cube with this side [m], centred above (x, 0), with its lower face at the height `bottom` [m]."""
     return block((side,) * 3, (x, 0.0, bottom + side / 2), **material)
 
 
 def block(sides: tuple[float, float, float], centre: tuple[float, float, float], **material) -> Specimen:
-    """An upright box; its Gaussians are a twenty-eighth of its longest side apart, or less."""
+    """An upright box with Gaussians at most 1 / POINTS_ALONG of its longest side apart."""
     spacing = max(sides) / POINTS_ALONG if min(sides) > max(sides) / 4 else min(sides) / 7
     return Specimen(box(sides, spacing).moved(centre), **material)
 
 
 def ball(radius: float, centre: tuple[float, float, float], **material) -> Specimen:
-    """A ball of this radius and centre [m]."""
+    """A ball with this radius and centre [m]."""
     return Specimen(ellipsoid((radius,) * 3, 1500).moved(centre), **material)
 
 
 def bowl(inner: float, outer: float) -> Surface:
-    """Half a spherical shell, open above, its lowest point at z = 0."""
+    """Half a spherical shell, open at the top, with its lowest point at z = 0."""
     centre = torch.tensor([0.0, 0.0, outer])
     shells = [ellipsoid((r,) * 3, n) for r, n in ((outer, 4000), (inner, 3000))]
     halves = [(s.points[s.points[:, 2] < 0], sign * s.normals[s.points[:, 2] < 0])
@@ -75,7 +75,7 @@ def bowl(inner: float, outer: float) -> Surface:
 
 
 def cylinder(radius: float, length: float, spacing: float) -> Surface:
-    """A solid cylinder around the y axis, its middle at the origin."""
+    """A solid cylinder about the y axis, centred on the origin."""
     around = torch.arange(0, 2 * math.pi, spacing / radius)
     a, y = torch.cartesian_prod(around, torch.linspace(-length / 2, length / 2, round(length / spacing) + 1)).T
     out = torch.stack([a.cos(), torch.zeros_like(a), a.sin()], 1)
@@ -90,7 +90,7 @@ def cylinder(radius: float, length: float, spacing: float) -> Surface:
 
 
 def wedge(length: float, width: float, degrees: float, spacing: float) -> Surface:
-    """A right-angled wedge on z = 0 around the z axis, whose upper face falls towards +x at this angle."""
+    """A right-angled wedge on z = 0, centred on the z axis; its upper face descends towards +x at this angle."""
     height = length * math.tan(math.radians(degrees))
     block = box((length, width, height), spacing).moved((0, 0, height / 2))
     below = block.points[:, 2] < height * (0.5 - block.points[:, 0] / length)
@@ -101,7 +101,7 @@ def wedge(length: float, width: float, degrees: float, spacing: float) -> Surfac
 
 
 def compound(spacing: float, *boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Surface:
-    """The union of upright boxes of these sides and centres [m]."""
+    """The union of upright boxes with these sides and centres [m]."""
 
     def part(sides: tuple[float, float, float], centre: tuple[float, float, float]):
         half = torch.tensor(sides) / 2 - 1e-4
@@ -111,21 +111,21 @@ def compound(spacing: float, *boxes: tuple[tuple[float, float, float], tuple[flo
 
 
 def about_z(surface: Surface, degrees: float) -> Surface:
-    """Turned about the z axis."""
+    """The surface rotated about the z axis."""
     a = math.radians(degrees)
     R = torch.tensor([[math.cos(a), -math.sin(a), 0.0], [math.sin(a), math.cos(a), 0.0], [0.0, 0.0, 1.0]])
     return Surface(surface.points @ R.mT, surface.normals @ R.mT)
 
 
 def tilted(surface: Surface, degrees: float) -> Surface:
-    """Turned about the y axis through the origin, so that +x points downhill."""
+    """The surface rotated about the y axis through the origin, so that +x points downhill."""
     a = math.radians(degrees)
     R = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
     return Surface(surface.points @ R.mT, surface.normals @ R.mT)
 
 
 def on_slope(degrees: float, loss: float, options: Mapping, body: Surface | None = None) -> Run:
-    """A body at rest at the origin, else a box of .2 x .2 x .1 m, on a pinned slope of 2 m."""
+    """A body (default: a box of .2 x .2 x .1 m) at rest on a pinned slope 2 m long; the body is given at the origin."""
     ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
     body = box((0.2, 0.2, 0.1), 0.008).moved((0, 0, 0.05)) if body is None else body
     body = tilted(body.moved((-0.5, 0, 0)), degrees).moved((0, 0, 1.2))

@@ -1,4 +1,4 @@
-"""All experiments, in the order of the report."""
+"""Catalogue of all experiments, in the order of the report."""
 
 from collections.abc import Mapping
 from functools import cache

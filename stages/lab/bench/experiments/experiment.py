@@ -1,6 +1,6 @@
-"""An experiment: scenes, what is measured in them, its analytic value, and the error allowed to each engine.
+"""Definition of an experiment: scenes, measured quantity, analytic value, and the error allowed for each engine.
 
-Tolerances are relative to `scale`: what the engines are required to reach, not what they do.
+Tolerances are relative to `scale`. They state what is required of the engines, not what they achieve.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ from dataclasses import dataclass
 
 from stages.lab.bench.experiments.bodies import Run
 
-G = 9.81
-TOLERANCES = {"rigid": 0.05, "mpm": 0.1, "ngff": 0.1}
-SLIDES = TOLERANCES | {"ngff": 0.15}
-GAPS = {"rigid": (-0.03, 0.05), "mpm": (-0.1, 0.1), "ngff": (-0.03, 0.05)}  # penetration, gap in heights
+G = 9.81  # gravitational acceleration [m/s^2]
+TOLERANCES = {"rigid": 0.05, "mpm": 0.1, "ngff": 0.1}  # default relative errors allowed
+SLIDES = TOLERANCES | {"ngff": 0.15}  # errors allowed for slides
+GAPS = {"rigid": (-0.03, 0.05), "mpm": (-0.1, 0.1), "ngff": (-0.03, 0.05)}  # largest penetration and gap [heights]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Runs, what is measured in their trajectories, and the value that theory gives."""
+    """Simulation runs, what is measured in their trajectories, and the value predicted by theory."""
 
     name: str  # group/case
     runs: tuple[Run, ...]
-    measure: Callable[..., float]  # of the trajectories of the runs
-    value: float
-    what: str  # name and unit of what is measured
+    measure: Callable[..., float]  # function of the trajectories of the runs
+    value: float  # analytic
+    what: str  # name and unit of the measured quantity
     scale: float  # error that counts as 1
-    tolerance: Mapping  # by engine: largest error, or lowest and highest
+    tolerance: Mapping  # by engine: largest error, or lowest and highest signed error
 
     def passes(self, engine: str, measured: float) -> bool:
         """Whether a value agrees with theory within the tolerance of the engine."""

@@ -1,4 +1,4 @@
-"""Experiments of bodies that slide, roll or lean on the floor, on a slope or on each other."""
+"""Experiments with bodies that slide, roll or lean on the floor, on a slope or on each other."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from stages.lab.bench.experiments.measures import path
 
 
 def slides() -> Iterator[Experiment]:
-    """Boxes that slide on the floor until friction stops them."""
+    """Boxes sliding on the floor until friction stops them."""
     for mu in (0.0, 0.1, 0.3, 0.6, 1.0):
         run = Run((block((0.3, 0.2, 0.08), (0, 0, 0.04)),), {"velocity": ("object=1 2,0,0",), "friction": mu})
         time = 99 * 0.02
@@ -35,12 +35,12 @@ def slides() -> Iterator[Experiment]:
                          "distance from 2 m/s in 2 s [m]", value, SLIDES)  # fmt: skip
 
     body = replace(block((0.3, 0.3, 0.15), (0, 0, 0.075)), loss=0.01)
-    run = Run((body,), {"velocity": ("object=1 .3,0,0",), "friction": 0.1})  # the speed of a fall of 5 mm
+    run = Run((body,), {"velocity": ("object=1 .3,0,0",), "friction": 0.1})  # the impact speed of a fall of 5 mm
     value = 0.09 / (2 * 0.1 * G)
     yield Experiment("slide/slow friction=0.1", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
                      "distance from .3 m/s [m]", value, SLIDES)  # fmt: skip
 
-    for mu in (0.1, 0.3, 0.6):  # a body that its weight compresses by 2.1 %
+    for mu in (0.1, 0.3, 0.6):  # a body that is compressed by 2.1 % under its own weight
         run = Run((block((0.3, 0.2, 0.08), (0, 0, 0.04), E=1e5, density=2700.0),),
                   {"velocity": ("object=1 1,0,0",), "friction": mu, "steps": 76})  # fmt: skip
         value = 1 / (2 * mu * G)
@@ -49,7 +49,7 @@ def slides() -> Iterator[Experiment]:
 
 
 def compound_slides() -> Iterator[Experiment]:
-    """Bodies of several boxes that start at 1 m/s along x on others of several boxes, which do not move."""
+    """Compound bodies that start at 1 m/s along x on other compound bodies, which are pinned."""
     stool = compound(0.008, ((0.3, 0.3, 0.04), (0, 0, 0.18)),
                      *(((0.04, 0.04, 0.16), (x, y, 0.08)) for x, y in product((-0.13, 0.13), repeat=2)))  # fmt: skip
     bridge = compound(0.01, ((0.3, 0.1, 0.04), (0, 0, 0.14)), ((0.04, 0.1, 0.12), (-0.13, 0, 0.06)),
@@ -73,7 +73,7 @@ def compound_slides() -> Iterator[Experiment]:
 
 
 def slopes() -> Iterator[Experiment]:
-    """A box let go on a slope, which slides or stays."""
+    """A box released on a slope, which slides or sticks."""
     for degrees, mu in product((10, 25, 40), (0.0, 0.3, 0.8)):
         a, time = math.radians(degrees), 30 * 0.02
         pull = G * max(math.sin(a) - mu * math.cos(a), 0.0)
@@ -83,7 +83,7 @@ def slopes() -> Iterator[Experiment]:
 
 
 def rolls() -> Iterator[Experiment]:
-    """A solid ball on a slope that grips: a = 5/7 g sin(slope), as its inertia is 2/5 m r^2."""
+    """A solid ball rolling on a slope without slip: a = 5/7 g sin(slope), since its inertia is 2/5 m r^2."""
     radius, time = 0.1, 30 * 0.02
     for degrees in (10, 25):
         distance = 5 / 7 * G * math.sin(math.radians(degrees)) * time**2 / 2
@@ -95,9 +95,9 @@ def rolls() -> Iterator[Experiment]:
 
 
 def rocking() -> Iterator[Experiment]:
-    """A block let go while it leans on a lower edge: it turns about the edge as a pendulum upside down."""
+    """A block released while leaning on a lower edge: it rotates about the edge like an inverted pendulum."""
     width, height, start, time = 0.2, 0.3, math.radians(12), 0.14
-    # the corners of a sampled box are half a spacing inside it, here 3 % of the lever arm of its weight
+    # the corner points of a sampled box lie half a spacing inside it, here 3 % of the lever arm of its weight
     leaning = tilted(box((width, height, height), 0.004).moved((-width / 2, 0, height / 2)), math.degrees(start))
     left = leaning_angle(width, height, start, time)
     run = Run((Specimen(leaning),), {"friction": 1.0, "dt": 0.01, "steps": 15})
@@ -110,10 +110,10 @@ def rocking() -> Iterator[Experiment]:
 
 
 def leaning_angle(width: float, height: float, start: float, time: float) -> float:
-    """Angle [rad] of a rigid block that leans on an edge, `time` [s] after it was let go at the angle `start`.
+    """Angle [rad] of a rigid block leaning on an edge, `time` [s] after its release at the angle `start` [rad].
 
     Housner 1963, "The behavior of inverted pendulum structures during earthquakes", equation 2:
-    4/3 m R^2 angle'' = -m g R sin(slenderness - angle), with the half diagonal R; integrated by small leapfrog steps.
+    4/3 m R^2 angle'' = -m g R sin(slenderness - angle), with half diagonal R; integrated by small leapfrog steps.
     """
     slenderness, half_diagonal = math.atan2(width, height), math.hypot(width, height) / 2
     steps = 10_000
@@ -125,7 +125,7 @@ def leaning_angle(width: float, height: float, start: float, time: float) -> flo
 
 
 def wedges() -> Iterator[Experiment]:
-    """A block on a wedge of its mass that slides on the floor, all without friction."""
+    """A block on a wedge of the same mass that can slide on the floor, without any friction."""
     degrees, length, width, side, time = 30.0, 0.4, 0.2, 0.16, 0.25
     below, block = wedge(length, width, degrees, 0.01), box((side,) * 3, 0.01).moved((0, 0, side / 2))
     block = tilted(block.moved((-0.08, 0, 0)), degrees).moved((0, 0, length / 2 * math.tan(math.radians(degrees))))
@@ -139,7 +139,7 @@ def wedges() -> Iterator[Experiment]:
 
 
 def ladders() -> Iterator[Experiment]:
-    """A ladder between a wall and a floor without friction, until it has turned by 21 degrees; it leaves them later."""
+    """A ladder between a wall and a floor without friction, until it has rotated 21 degrees; later it loses contact."""
     length, thick, spacing, start, time = 1.0, 0.06, 0.01, 60.0, 0.3
     ladder = tilted(box((length, 0.2, thick), spacing), start)
     low = ladder.points.amin(0).tolist()
@@ -148,7 +148,7 @@ def ladders() -> Iterator[Experiment]:
               {"pin": ("1",), "friction": 0.0, "dt": 0.01, "steps": 31})  # fmt: skip
     left = ladder_angle(
         length - spacing, thick - spacing, math.radians(start), time
-    )  # the faces end half a spacing inside
+    )  # the edges of the sampled faces lie half a spacing inside
 
     def turned(t: Trajectory) -> float:
         return math.degrees(abs(2 * math.atan2(*t.rotation[-1, 1, [2, 0]].tolist())))
@@ -158,10 +158,10 @@ def ladders() -> Iterator[Experiment]:
 
 
 def ladder_angle(length: float, thick: float, start: float, time: float) -> float:
-    """Angle [rad] of a board that leans on a wall, `time` [s] after it was let go at the angle `start`, while the edges
-    of its lower side touch wall and floor without friction.
+    """Angle [rad] of a board leaning on a wall, `time` [s] after its release at the angle `start` [rad].
 
-    Lagrange's equation for a kilogram of it, whose middle is at x, z (derivatives by the angle):
+    The edges of its lower side touch wall and floor without friction. Lagrange's equation per unit mass, with the
+    centre at x, z and primes for derivatives by the angle:
     (I + x'^2 + z'^2) angle'' = -g z' - (x' x'' + z' z'') angle'^2; integrated by small steps.
     """
     steps = 10_000
@@ -177,7 +177,7 @@ def ladder_angle(length: float, thick: float, start: float, time: float) -> floa
 
 
 def levers() -> Iterator[Experiment]:
-    """A board on a fixed round bar, with a block on each arm, the right one of twice the mass of the left one."""
+    """A board on a fixed round bar with a block on each arm, the right one with twice the mass of the left one."""
     radius, length, thick, side, arm, time = 0.15, 1.2, 0.03, 0.08, 0.4, 0.15
     top = 0.4 + radius
     board = box((length, 0.2, thick), 0.005).moved((0, 0, top + thick / 2))
@@ -188,7 +188,8 @@ def levers() -> Iterator[Experiment]:
               {"pin": ("1",), "friction": 0.8, "dt": 0.01, "steps": 16})  # fmt: skip
     mass, light = 540.0 * length * 0.2 * thick, 1000.0 * side**3
     up = thick + side / 2
-    inertia = mass * (length**2 / 12 + thick**2 / 3) + 3 * light * (side**2 / 6 + arm**2 + up**2)  # about the contact
+    # moment of inertia about the contact line
+    inertia = mass * (length**2 / 12 + thick**2 / 3) + 3 * light * (side**2 / 6 + arm**2 + up**2)
     value = math.degrees(light * arm * G / inertia * time**2 / 2)
 
     def turned(t: Trajectory) -> float:
@@ -198,7 +199,7 @@ def levers() -> Iterator[Experiment]:
 
 
 def creep() -> Iterator[Experiment]:
-    """A box that friction holds on a slope, for ten seconds."""
+    """A box held by friction on a slope for ten seconds."""
     for loss in (0.02, 0.15):
         run = on_slope(15, loss, {"friction": 0.3, "steps": 501})  # tan 15 degrees is .268
         yield Experiment(f"creep/15deg friction=0.3 loss={loss:g}", (run,),

@@ -1,4 +1,4 @@
-"""Experiments of free motion, of its symmetries, and of impacts."""
+"""Experiments on free motion, its invariance to units, and impacts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def falls() -> Iterator[Experiment]:
 
 
 def torques() -> Iterator[Experiment]:
-    """A torque and a push of .2 s on a box and a ball in free space."""
+    """A torque and a force, each applied for .2 s, on a box and a ball in free space."""
     density, side, radius = 540.0, 0.3, 0.15
     mass = {"box": density * side**3, "ball": density * 4 / 3 * math.pi * radius**3}
     inertia = {"box": mass["box"] * side**2 / 6, "ball": 0.4 * mass["ball"] * radius**2}
@@ -43,10 +43,10 @@ def torques() -> Iterator[Experiment]:
 
 
 def invariance() -> Iterator[Experiment]:
-    """The same motion in other units of length and of mass."""
+    """The same motion in other units of length and mass."""
 
     def stack(s: float = 1.0, factor: float = 1.0) -> Run:
-        more = {"density": 540.0 * factor, "E": 1e7 * factor * s}  # E / (density g size) stays the same
+        more = {"density": 540.0 * factor, "E": 1e7 * factor * s}  # keeps E / (density g size) constant
         return Run((cube(0.3 * s, **more), cube(0.18 * s, 0.02 * s, 0.33 * s, **more)),
                    {"steps": 40, "dt": 0.02 * math.sqrt(s),
                     "velocity": (f"object=2 {0.5 * math.sqrt(s)},0,0",)})  # fmt: skip
@@ -61,7 +61,7 @@ def invariance() -> Iterator[Experiment]:
 
 
 def collisions() -> Iterator[Experiment]:
-    """Two balls that collide in free space, and two boxes at rest beside each other."""
+    """Collisions in free space and of a row of balls, and two boxes at rest beside each other."""
     pair = Run((ball(0.15, (0, 0, 0.5)), ball(0.15, (0.6, 0, 0.5), density=1080.0)),
                {"gravity": 0.0, "velocity": ("object=1 1,0,0",), "steps": 50})  # fmt: skip
     mass = torch.tensor([1.0, 2.0])
@@ -84,20 +84,20 @@ def collisions() -> Iterator[Experiment]:
 
 
 def rebounds() -> Iterator[Experiment]:
-    """Balls and boxes that fall on the floor from half a metre."""
+    """Balls and boxes that fall onto the floor from half a metre."""
     for (name, body), loss in product((("ball", ball(0.15, (0, 0, 0.15))), ("box", cube(0.3))), (0.05, 0.15, 0.4)):
         run = Run((replace(body, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
         yield Experiment(f"rebound/{name} loss={loss:g}", (run,), lambda t: rebound(t, 0.5),
                          math.exp(-math.pi * loss / 2), "restitution", 1.0, TOLERANCES)  # fmt: skip
 
-    soft = replace(ball(0.15, (0, 0, 0.15)), E=2e5, density=600.0)  # the impact compresses it by a sixth
+    soft = replace(ball(0.15, (0, 0, 0.15)), E=2e5, density=600.0)  # compressed by a sixth in the impact
     run = Run((soft,), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
     yield Experiment("rebound/soft ball loss=0.15", (run,), lambda t: rebound(t, 0.5), math.exp(-math.pi * 0.15 / 2),
                      "restitution", 1.0, TOLERANCES)  # fmt: skip
 
 
 def bounces() -> Iterator[Experiment]:
-    """A ball that falls .5 m while it flies sideways: friction takes mu (1 + e) of its normal speed, until it rolls."""
+    """A ball falls .5 m with a horizontal speed: friction takes mu (1 + e) times its normal speed, until it rolls."""
     for loss, mu in product((0.02, 0.15), (0.1, 0.5)):
         body = replace(ball(0.15, (0, 0, 0.15)), loss=loss)
         run = Run((body,), {"lift": ("0.5",), "velocity": ("object=1 3,0,0",), "friction": mu, "dt": 0.01, "steps": 61})

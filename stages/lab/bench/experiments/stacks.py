@@ -1,4 +1,4 @@
-"""Experiments of bodies that come to rest on each other."""
+"""Experiments with bodies that come to rest on each other."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.lab.bench.experiments.measures import gap, largest_shift, overlap, p
 
 
 def towers() -> Iterator[Experiment]:
-    """Upright towers of cubes, of which the topmost is let fall from 5 mm."""
+    """Upright towers of cubes, with the topmost dropped from 5 mm."""
     for count, seconds in ((3, 2), (6, 2), (10, 2), (6, 20)):
         cubes = tuple(cube(0.2, bottom=0.2 * i) for i in range(count))
         run = Run(cubes, {"steps": 50 * seconds, "lift": (f"{count}=.005",)})
@@ -24,7 +24,7 @@ def towers() -> Iterator[Experiment]:
 
 
 def stacks() -> Iterator[Experiment]:
-    """Bodies of unequal stiffness or size on each other."""
+    """Stacked bodies of unequal stiffness or size."""
     soft = (cube(0.3, E=1e5, density=100.0), cube(0.15, bottom=0.31, E=1e9, density=2700.0))
     small = (cube(0.5), cube(0.05, bottom=0.505))
     rod = (cube(0.2, -0.3), cube(0.2, 0.3), block((1.0, 0.1, 0.1), (0, 0, 0.26)))
@@ -38,13 +38,13 @@ def stacks() -> Iterator[Experiment]:
 
 
 def piles() -> Iterator[Experiment]:
-    """Many balls in a heap, and one in a bowl."""
+    """Heaps of many balls, a pile of logs, and a ball in a bowl."""
     inside = Run((Specimen(bowl(0.25, 0.3), E=1e7), ball(0.08, (0.0, 0.0, 0.14), loss=0.4)), {"steps": 150})
     yield Experiment("pile/ball in a bowl", (inside,), lambda t: float(t.com[-1, 1, 2]) / 0.08, 0.13 / 0.08,
                      "height of its middle [radii]", 1.0, TOLERANCES)  # fmt: skip
     places = ((-0.1, 0.1), (0.1, 0.1), (0.0, 0.1 + 0.1 * math.sqrt(3)))
     logs = tuple(Specimen(cylinder(0.1, 0.3, 0.01).moved((x, 0, z)), loss=0.02) for x, z in places)
-    # forces between logs act at 15 degrees to the normal, of which the tangent is .268
+    # the contact forces between logs are 15 degrees from the normal, whose tangent is .268
     yield Experiment("pile/three logs", (Run(logs, {"friction": 0.3}),), lambda t: float(-path(t, 2)[-1, 2]) / 0.1, 0.0,
                      "fall of the upper one in 2 s [radii]", 1.0, TOLERANCES)  # fmt: skip
     for count in (20, 40):
@@ -58,9 +58,10 @@ def piles() -> Iterator[Experiment]:
 
 
 def boxes() -> Iterator[Experiment]:
-    """A box that falls on a larger one, of materials from foam to steel."""
+    """A box that falls onto a larger one, with materials from foam to steel."""
     for side, density, E in product((0.03, 0.06, 0.15, 0.3), (50.0, 540.0, 1000.0, 2700.0, 7850.0), (1e5, 1e7, 1e9)):
         pair = (cube(5 / 3 * side, E=E, density=density), cube(side, bottom=5 / 3 * side, E=E, density=density))
-        dropped = Run(pair, {"steps": 50, "lift": (f"2={0.1 * side:g}",)})  # what is not lifted may sleep where it is
+        # the upper box is lifted, since a box at rest may be put to sleep at its initial position
+        dropped = Run(pair, {"steps": 50, "lift": (f"2={0.1 * side:g}",)})
         yield Experiment(f"boxes/{side:g}m {density:g}kg/m3 {E:.0e}Pa", (dropped,), gap, 0.0, "gap after 1 s [heights]",
                          1.0, GAPS)  # fmt: skip

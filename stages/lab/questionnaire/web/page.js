@@ -1,13 +1,13 @@
 "use strict";
-// One participant: films in a fixed order, the answers to each, kept in localStorage until they are downloaded.
+// One participant's page: films in a fixed order, with the answers kept in localStorage until they are downloaded.
 const study = JSON.parse(document.getElementById("study").textContent);
 const key = `ngff-questionnaire-${study.study}-${study.participant}`;
 const $ = (selector) => document.querySelector(selector);
 const video = $("video"), form = $("form");
 let state = load();
-let since = 0; // when the film was shown [ms]
+let since = 0; // time at which the film was shown [ms]; 0: none
 
-/** Answers that an earlier visit left, or none. */
+/** Answers from an earlier visit, or none. */
 function load() {
   const empty = { index: -1, answers: {} };
   try {
@@ -21,7 +21,7 @@ function save() {
   try {
     localStorage.setItem(key, JSON.stringify(state));
   } catch {
-    // storage is blocked: the answers last as long as the page
+    // storage is blocked: the answers are lost when the page is closed
   }
 }
 
@@ -47,7 +47,7 @@ function go(index) {
     return show("end");
   }
   show("trial");
-  document.activeElement?.blur(); // keys go to the page, not to a button that was pressed
+  document.activeElement?.blur(); // so that keys act on the page instead of the last clicked button
   since = performance.now();
   answer().unplayable = false;
   video.src = `films/${film()}.mp4`;
@@ -57,10 +57,10 @@ function go(index) {
 
 function play() {
   video.currentTime = 0;
-  video.play().catch(() => {}); // where playing by itself is forbidden, "Play again" is there
+  video.play().catch(() => {}); // if autoplay is blocked, the user can click "Play again"
 }
 
-/** Bring the page in line with the answers. */
+/** Update the page to show the current answers. */
 function update() {
   const a = answer();
   for (const scale of study.scales) {

@@ -1,1 +1,1 @@
-"""Training of dynamics models and of the splat head."""
+"""Training of the dynamics models, the segmentation network and the splat head."""

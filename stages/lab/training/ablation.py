@@ -1,4 +1,4 @@
-"""Ablations of the force field: the network, or its training options, with one component removed."""
+"""Ablations of the force field: its network or training options with one component removed."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from stages.core.models.field.force_field import FieldScene, ForceField
 from stages.core.models.field.rest_shape import RestShape
 from stages.lab.training.options import TrainOptions
 
-IMPULSE_VECTORS = 2  # last vector features of a contact: impulses that stop its motion, and its normal motion
+IMPULSE_VECTORS = 2  # last vector features of a contact: the impulses that stop its motion and its normal motion
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """One component removed, by another network or by other training options."""
+    """Removal of one component, by another network or by other training options."""
 
-    without: str  # what is removed, for the table
+    without: str  # description of the component for the table
     network: Callable[[], Dynamics] = ForceField
     options: Callable[[TrainOptions], TrainOptions] = lambda options: options
 
 
 class _UnfusedForceField(ForceField):
-    """Without the fused kernels, which implement the full network only."""
+    """A force field without the fused kernels, which implement only the full network."""
 
     def _use_fused_step(self, scene: FieldScene) -> bool:
         return False
@@ -42,7 +42,7 @@ class NoReaction(_UnfusedForceField):
 
 
 class NoMaterialInputs(_UnfusedForceField):
-    """The same stiffness, Poisson ratio and friction for all objects as network inputs; masses are the true ones."""
+    """Constant stiffness, Poisson ratio and friction as network inputs for all objects; masses stay true."""
 
     def encode(self, shape: RestShape) -> FieldScene:
         """Embeddings and springs for E = 1e5 Pa, Poisson ratio 0.3 and friction 0.5; `shape` is returned unchanged."""
@@ -73,7 +73,7 @@ class _NoImpulseFeatures(ContactNet):
 
 
 class _ZeroFeatures(nn.Module):
-    """Zeros of a given width in place of a network output."""
+    """A module whose output is zeros of a given width."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -84,7 +84,7 @@ class _ZeroFeatures(nn.Module):
 
 
 def no_impulse_features() -> ForceField:
-    """The force field without impulses among its contact features."""
+    """The force field with impulses removed from its contact features."""
     model = _UnfusedForceField()
     h = model.config["hidden"]
     model.pairs, model.planes = _NoImpulseFeatures(10, 7, h, partner=True), _NoImpulseFeatures(8, 5, h, partner=False)

@@ -1,7 +1,7 @@
 """Weighted averages of the weights of several trainings of one model, parameter by parameter.
 
-Only weights with a common start have a meaningful average. Source: Wortsman et al. 2022, "Model soups"; and, for
-an average with the weights that a training began with, Wortsman et al. 2022, "Robust fine-tuning of zero-shot models".
+Only weights with a common starting point have a meaningful average. Source: Wortsman et al. 2022, "Model soups"; for
+an average with the initial weights, Wortsman et al. 2022, "Robust fine-tuning of zero-shot models".
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from stages.lab.training.history import merge
 
 @torch.no_grad()
 def run(files: Sequence[Path], given: str, out: Path, half: bool = False) -> str:
-    """Write the average of weights by ratios such as 0.7,0.3, and its card; return a line about it.
+    """Write the average of weights for ratios such as 0.7,0.3, and its card; return a line about it.
 
-    The card has the runs of all cards, then the average; device, options and curve are those of the first file. `half`
-    stores 16-bit numbers. Raises InputError for ratios that do not add up to 1, and for weights of different models.
+    The card lists the runs of all cards, followed by the average; device, options and curve are those of the first
+    file. `half` stores 16-bit numbers. Raises InputError if the ratios do not add up to 1 or the models differ.
     """
     ratios = _numbers(given)
     if len(files) != len(ratios) or len(files) < 2 or min(ratios) < 0 or not math.isclose(sum(ratios), 1):

@@ -1,4 +1,4 @@
-"""Cards of weights: a line about the training of each, and their training curves in one figure."""
+"""Summary of cards of weights: a line about each training, and all training curves in one figure."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ CARD = "the card of weights (.json), such as `ngff-lab train` writes"
 
 
 def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
-    """Plot the curves of the last training run of each card; return a line about each.
+    """Plot the training curves of cards; return a line about each.
 
-    `half` also rewrites the weights of each card in 16 bits, as weights are shipped. Raises InputError for files
-    that are not cards, and for two cards of one name.
+    A curve is that of the last training run. `half` also rewrites the weights of each card in 16 bits, as for shipped
+    weights. Raises InputError for files that are not cards, and for two cards with the same name.
     """
     rows = {Path(card).stem: _read(Path(card)) for card in cards}
     if len(rows) < len(cards):
@@ -36,7 +36,7 @@ def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
 
 
 def _read(card: Path) -> dict:
-    """A card with its curve as lists of one length."""
+    """Read a card and check that the columns of its curve have equal length."""
     must_exist(card, CARD)
     try:
         row = read_json(card)
@@ -48,13 +48,13 @@ def _read(card: Path) -> dict:
 
 
 def _curve(row: dict, key: str) -> list[tuple[float, float]]:
-    """(minutes, value) wherever there is a value."""
+    """Points (minutes, value), without missing values."""
     pairs = zip(row["curve"]["minutes"], row["curve"][key], strict=True)
     return [(float(minute), value) for minute, value in pairs if isinstance(value, (int, float))]
 
 
 def _summary(name: str, row: dict) -> str:
-    """A line: model, scenes of the last training run, minutes of all runs, device, last validation score."""
+    """A line with model, scenes of the last training run, minutes of all runs, device, and last validation score."""
     last = next((run for run in reversed(row["runs"]) if "minutes" in run), {})
     best, minutes = last.get("validation") or {}, total_minutes(row)
     score = "  ".join(f"{k} {best[k]:.4f}" for k in ("RMSE", "FPE", "R") if isinstance(best.get(k), (int, float)))

@@ -17,19 +17,20 @@ from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import KeypointMotions, motions_folder
 
-VALIDATION_SCENES = 100  # at the end of the last group: they only select the best weights
-# RMS change of velocity from frame to frame [m/s] above which an object is in a collision, where central differences
-# do not approximate its velocity
+VALIDATION_SCENES = 100  # number of scenes at the end of the last group, used only to select the best weights
+# RMS change of velocity from frame to frame [m/s] above which an object is assumed to be in a collision, where central
+# differences do not approximate its velocity
 MAX_SPEED_CHANGE = 0.3
-MAX_RESTING_SPEED, REST_FRAMES = 0.02, 5  # scenes slower [m/s] in their last frames are taken to remain at rest
+# a scene is assumed to remain at rest if it is slower [m/s] in this number of final frames
+MAX_RESTING_SPEED, REST_FRAMES = 0.02, 5
 
 
 @dataclass(frozen=True)
 class MotionClip:
     """A batch of short motions."""
 
-    world: InitialConditions  # at rest, as of the first frame of the whole motion
-    rest: Any  # the model's precomputed features of it (`Dynamics.precompute`)
+    world: InitialConditions  # at rest, in the first frame of the whole motion
+    rest: Any  # the model's precomputed features of `world` (`Dynamics.precompute`)
     points: Float[Tensor, "b o n 3"]  # keypoints at the start of the clip [m]
     speed: Float[Tensor, "b o n 3"]  # their velocities [m/s]
     truth: Float[Tensor, "b t o n 3"]  # keypoints in the frames after the start [m]
@@ -37,7 +38,7 @@ class MotionClip:
 
 
 def train_validation_split(motions: KeypointMotions, count: int) -> tuple[KeypointMotions, KeypointMotions]:
-    """Training scenes, and the last `count` (a third at most) for validation. Raises InputError for a single scene."""
+    """Training scenes, and the last `count` (at most a third) for validation. Raises InputError for a single scene."""
     count = max(1, min(count, len(motions) // 3))
     if len(motions) < 2:
         raise InputError("training needs at least two scenes: one for training, one for validation")
@@ -50,10 +51,10 @@ def describe_groups(folder: Path, names: Sequence[str]) -> dict[str, str]:
 
 
 class ClipSampler:
-    """Random clips of scenes that lie in the memory of a device.
+    """Random clips of scenes that are stored in the memory of a device.
 
-    Clips begin only in frames without an impact, where velocities are known by central differences. Scenes that end at
-    rest are continued at rest beyond their last frame.
+    Clips start only in frames without an impact, where central differences give the velocities. Scenes that end at rest
+    are continued at rest beyond their last frame.
     """
 
     def __init__(self, motions: KeypointMotions, device: torch.device | str, model: Dynamics):
@@ -65,9 +66,9 @@ class ClipSampler:
         self.spread = motion_spread(self.motions)
 
     def draw(self, count: int, horizon: int, generator: torch.Generator, part: slice = slice(None)) -> MotionClip:
-        """Clips of `horizon` frames after their first, of `count` random scenes from random frames on.
+        """Random clips of `count` random scenes, with `horizon` frames after the start.
 
-        `part` are the rows of the batch to return; the random numbers do not depend on it.
+        `part` selects the rows of the batch to return; the random numbers do not depend on it.
         """
         points = self.motions.points
         frames = points.shape[1]
@@ -78,7 +79,7 @@ class ClipSampler:
         return self.take(row[part], start[part], horizon)
 
     def take(self, row: Tensor, start: Tensor, horizon: int) -> MotionClip:
-        """Clips of given scenes from given frames on; velocities are central differences, and 0 in frame 0."""
+        """Clips of given scenes starting in given frames; velocities are central differences, 0 in frame 0."""
         points, dt = self.motions.points, self.motions.dt
         row, start = row.to(points.device), start.to(points.device)
         frames = start[:, None] + torch.arange(1, horizon + 1, device=start.device)
@@ -89,7 +90,7 @@ class ClipSampler:
 
 
 def ends_at_rest(motions: KeypointMotions) -> Bool[Tensor, "b"]:
-    """Whether each scene has come to rest at its end; on the CPU."""
+    """Whether each scene is at rest in its last frames; on the CPU."""
     last = motions.points[:, -REST_FRAMES - 1 :]
     speed = (last[:, 1:] - last[:, :-1]).norm(dim=-1).mean(1) / motions.dt
     return (speed.flatten(1).amax(1) < MAX_RESTING_SPEED).cpu()
@@ -101,13 +102,13 @@ def motion_spread(motions: KeypointMotions) -> Float[Tensor, "b o 3"]:
 
 
 def smooth_frames(motions: KeypointMotions) -> Bool[Tensor, "b t"]:
-    """Frames in which no object is in a collision (the first and last frame count as such); on the CPU."""
+    """Frames in which no object is in a collision, including the first and last frame; on the CPU."""
     inner = torch.stack([smooth_motion(x, motions.dt).all(-1) for x in motions.points]).cpu()
     ends = torch.ones(len(inner), 1, dtype=torch.bool)
     return torch.cat([ends, inner, ends], 1)
 
 
 def smooth_motion(points: Float[Tensor, "*b t o n 3"], dt: float) -> Bool[Tensor, "*b t-2 o"]:
-    """In which frames but the first and last an object's velocity is known by central differences."""
+    """For all frames but the first and last, whether central differences give an object's velocity."""
     before, now, after = points[..., :-2, :, :, :], points[..., 1:-1, :, :, :], points[..., 2:, :, :, :]
     return (after - 2 * now + before).square().sum(-1).mean(-1) < (MAX_SPEED_CHANGE * dt) ** 2

@@ -1,6 +1,6 @@
-"""Data-parallel training by several processes, as `torchrun` starts them: each computes a part of every batch.
+"""Data-parallel training by several processes started by `torchrun`, each of which computes a part of every batch.
 
-All processes draw the same batch and keep their own rows of it, so that the result does not depend on their number.
+All processes draw the same batch and keep only their rows, so that the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ class ProcessGroup:
         return [part.view_as(x) for part, x in zip(parts, tensors, strict=True)]
 
     def broadcast(self, value: float) -> float:
-        """The value that rank 0 has."""
+        """The value of rank 0, in all processes."""
         if self.size == 1:
             return value
-        sent = torch.tensor(value, dtype=torch.float64)  # not on the device, for which the host would have to wait
+        sent = torch.tensor(value, dtype=torch.float64)  # on the CPU, so that the host need not wait for the GPU
         dist.broadcast(sent, 0)
         return sent.item()
 
 
 @contextmanager
 def process_group(device: str, batch: int = 0) -> Iterator[ProcessGroup]:
-    """The process group that torchrun started; without torchrun this process alone.
+    """The process group started by torchrun; without torchrun, this process alone.
 
-    Raises InputError for a batch that the processes cannot divide evenly.
+    Raises InputError if the batch cannot be divided evenly among the processes.
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:

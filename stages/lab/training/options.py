@@ -8,7 +8,7 @@ from stages.core.options import device_option, option, seed_option
 
 LOSSES = ("square", "scene", "axes", "relative")
 OPTIMIZERS = ("adamw", "soap")
-HORIZON_FRACTIONS = (0.35, 0.35, 0.3)  # of the budget, for three horizons
+HORIZON_FRACTIONS = (0.35, 0.35, 0.3)  # fractions of the budget for three horizons; other numbers share it equally
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TrainOptions:
     compiled: bool = option(False, "compile the training step first; for GPUs")
     seed: int = seed_option()
     device: str = device_option()
-    checks: int = 24  # validations and checkpoints in the whole run
+    checks: int = 24  # number of validations and checkpoints in the whole run
 
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
@@ -59,27 +59,27 @@ class TrainOptions:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The horizons as numbers. Raises InputError where they are none."""
+        """The horizons as numbers. Raises InputError if they cannot be parsed."""
         try:
             return tuple(int(word) for word in self.horizons.split(","))
         except ValueError as error:
             raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}") from error
 
     def horizon(self, progress: float) -> int:
-        """Frames of a rollout at this fraction of the budget."""
+        """Rollout length at a fraction of the budget [frames]."""
         n = len(self.frames)
         fractions = HORIZON_FRACTIONS
         ends = [sum(fractions[: i + 1]) if n == len(fractions) else (i + 1) / n for i in range(n)]
         return self.frames[min(sum(progress >= e for e in ends), n - 1)]
 
     def rate(self, progress: float) -> float:
-        """Learning rate at this fraction of the budget: half a cosine down to a hundredth."""
+        """Learning rate at a fraction of the budget: cosine decay to a hundredth."""
         return self.lr * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
 
 
 @dataclass(frozen=True)
 class SplatterOptions:
-    """Length, views, depth and optimizer of a training run."""
+    """Length, views, depth and optimizer of a training run of the splat head."""
 
     steps: int = option(20_000, "optimizer steps")
     views: int = option(4, "input views per step; one more view is rendered")
@@ -101,7 +101,7 @@ class SplatterOptions:
 
 @dataclass(frozen=True)
 class SegmenterTraining:
-    """Settings of the training."""
+    """Settings of a training run of the segmentation network."""
 
     minutes: float = option(30.0, "training time of the network [min]; 0: train only the candidate scores")
     steps: int = option(0, "optimizer steps instead of --minutes; 0: use --minutes")

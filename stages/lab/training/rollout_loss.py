@@ -1,7 +1,7 @@
 """Loss of a batch and its gradient: forward and backward pass of a rollout, replayed as one CUDA graph on a GPU.
 
 The computations done once per scene (`precompute`, `encode`, `state_from_motion`) include matrix decompositions that
-synchronise with the host, so they are outside of the graph; their gradients are chained to those of the graph
+synchronise with the host, so they are outside of the graph. Their gradients are chained to those of the graph
 explicitly.
 """
 
@@ -22,18 +22,18 @@ from stages.core.models.trees import leaf_tensors, replace_tensors
 from stages.lab.training.data import MotionClip, smooth_motion
 
 log = logging.getLogger(__name__)
-UNIT = 0.01  # errors count in centimetres, so that gradients are of order one [m]
-ERROR_FLOOR = 0.1  # added in quadrature to errors before the root: a millimetre [UNIT]
-MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # floor, and reference value, of the motion that "relative" divides by [UNIT]
+UNIT = 0.01  # unit of errors, so that gradients are of order one [m]
+ERROR_FLOOR = 0.1  # added in quadrature to errors before taking the root [UNIT]: a millimetre
+MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # offset and reference value of the spread that "relative" divides by [UNIT]
 
 
 @dataclass(frozen=True)
 class LossOptions:
-    """Weights and terms of the loss."""
+    """Kind and weights of the terms of the loss."""
 
     kind: str = "square"  # one of LOSSES
-    velocity_time: float = 0.0  # [s]: factor that converts velocity errors to position errors; 0: no velocity errors
-    gradient_discount: float = 1.0  # factor on a gradient per frame of backpropagation, which amplifies it at contacts
+    velocity_time: float = 0.0  # weight of velocity errors relative to position errors [s]; 0: no velocity errors
+    gradient_discount: float = 1.0  # factor on the gradient per frame; contacts amplify it in backpropagation
 
 
 def keypoint_loss(
@@ -44,7 +44,7 @@ def keypoint_loss(
 
     "square" is the mean squared coordinate error [cm^2], "scene" the mean RMSE of a scene [cm], "axes" the mean RMSE
     over axes of objects [cm], in which small motions count as much as the fall. "relative" divides the latter by the
-    `spread` of the true motion along that axis, as the correlation R does.
+    `spread` of the true motion along that axis, like the correlation R.
     """
     squared = ((predicted - truth) / UNIT).square().mean(1)
     squared = torch.where(valid[..., None], squared, 0.0)
@@ -63,11 +63,11 @@ def velocity_loss(
     predicted: Float[Tensor, "b t o n 3"], points: Float[Tensor, "b t+1 o n 3"], valid: Bool[Tensor, "b o n"],
     spread: Float[Tensor, "b o 3"], dt: float, options: LossOptions,
 ) -> Float[Tensor, ""]:  # fmt: skip
-    """Error of velocities in all frames but the last, weighed as positions `options.velocity_time` later.
+    """Velocity errors in all frames but the last, converted to position errors after `options.velocity_time`.
 
-    It penalises oscillations whose positions cancel from step to step. `points` are the true keypoints, from the frame
-    before the first prediction on. The true velocities are central differences; frames of an object in a collision,
-    where these mean nothing, do not count.
+    It penalises oscillations whose positions cancel from step to step. `points` holds the true keypoints, starting one
+    frame before the first prediction. The true velocities are central differences, so frames in which an object is in a
+    collision are ignored.
     """
     truth, time = (points[:, 2:] - points[:, :-2]) / (2 * dt), options.velocity_time
     known = smooth_motion(points, dt)[..., None, None]
@@ -78,7 +78,7 @@ def velocity_loss(
 class RolloutLoss:
     """Callable on clips of one batch size and horizon: the loss, and its gradient for each of the model's parameters.
 
-    `graph` records the rollout as a CUDA graph on a GPU; `compiled` compiles a step first. Where either fails, training
+    `graph` records the rollout as a CUDA graph on a GPU; `compiled` compiles the step first. If either fails, training
     continues without it.
     """
 
@@ -113,12 +113,12 @@ class RolloutLoss:
         return loss, self._chain(scene, grads)
 
     def _rollout(self, inputs: tuple) -> tuple[Tensor, list[Tensor | None]]:
-        """The loss, and its gradients for the parameters, then for the tensors of the prepared scene."""
+        """The loss, and its gradients with respect to the parameters and to the tensors of the prepared scene."""
         scene, state, start, truth, valid, spread = inputs
         options = self.options
         leaves = [x.detach().requires_grad_(x.requires_grad) for x in leaf_tensors(scene)]
         scene = replace_tensors(scene, iter(leaves))
-        # with gradients, so that the first step is like the others to a compiler
+        # the state requires gradients, so that the compiler sees the first step like all others
         state = replace_tensors(state, (x.detach().requires_grad_() for x in leaf_tensors(state)))
         external = ExternalForces.none_for(valid, truth)
         frames = []
@@ -138,12 +138,12 @@ class RolloutLoss:
         return loss.detach(), list(torch.autograd.grad(loss, with_gradient, allow_unused=True))
 
     def _test_compiled(self, inputs: tuple) -> None:
-        """Compile; where that fails or gives gradients that are not finite, warn and use the plain step."""
+        """Compile; if this fails or gives non-finite gradients, warn and use the uncompiled step."""
         try:
             if all(bool(g.isfinite().all()) for g in self._rollout(inputs)[1] if g is not None):
                 return
             why = "gives gradients that are not finite"
-        except Exception as error:  # a compiler fails in many ways
+        except Exception as error:  # compilers raise many types of exceptions
             why = f"fails ({str(error).strip().splitlines()[0]})"
         log.warning("compiling the step %s: going on without", why)
         self.advance = _advance
@@ -160,9 +160,9 @@ class RolloutLoss:
         return [_sum(p, a, b) for p, a, b in zip(self.params, direct, through_scene, strict=True)]
 
     def _capture(self, inputs: tuple) -> None:
-        """Record the rollout as a CUDA graph; where that fails, log it and go on without."""
+        """Record the rollout as a CUDA graph; if this fails, log it and continue without."""
         self.record_graph = False
-        # leaf tensors with their own memory, which the graph reads
+        # leaf tensors with separate memory, from which the graph reads its inputs
         static = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
                   for x in leaf_tensors(inputs)]  # fmt: skip
         static = replace_tensors(inputs, iter(static))
@@ -184,9 +184,10 @@ class RolloutLoss:
 def _advance(
     model: Dynamics, scene: Any, state: tuple, dt: float, external: ExternalForces, speeds: bool
 ) -> tuple[Tensor, ...]:
-    """The tensors of the next state, its keypoints and, with `speeds`, their velocities. Time only matters to forces.
+    """The tensors of the next state, its keypoints, and with `speeds` their velocities.
 
-    One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
+    The time passed to the model is 0, since only external forces depend on it. The result is one flat tuple, because
+    PyTorch 2.11 compiles a named tuple returned by `_replace` to an empty one.
     """
     state = model.step(scene, state, 0.0, dt, external)
     return (*state, model.points(scene, state), *([model.point_velocity(scene, state, external)] if speeds else []))

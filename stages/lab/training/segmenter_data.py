@@ -1,4 +1,4 @@
-"""Training scenes of the segmentation network: reconstructed clutter with the labels of the true scene."""
+"""Training scenes of the segmentation network: reconstructed clutter, labelled from the true scene."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from stages.lab.clutter.examples import Example, labelled, write_example
 from stages.lab.clutter.reconstruction import FLOATER
 from stages.lab.clutter.scenes import OBSERVED, RECONSTRUCTED, TRUTH
 
-RECONSTRUCTION = "scene.ply"
-MIN_OBJECT = 8  # voxels of an object that counts
-MAX_PAIRS = 60_000  # of a scene
-MAX_FLOATERS = 25  # clouds of points that belong to nothing
-APART = 2048  # voxels between the scenes of a batch, a multiple of the coarsest voxel
-SCALE_RANGE = 0.8, 2.4  # of augmented examples; includes voxels.SCALES
-MAX_RELIEF = 0.012  # [camera distance]
-LONG_REACH = 0.12  # of distant pairs of voxels [camera distance]
+RECONSTRUCTION = "scene.ply"  # file name of a reconstruction in a scene folder
+MIN_OBJECT = 8  # smallest number of voxels of an object
+MAX_PAIRS = 60_000  # largest number of voxel pairs per scene
+MAX_FLOATERS = 25  # largest number of clouds of floaters
+APART = 2048  # distance between the scenes of a batch [voxels], a multiple of the coarsest voxel
+SCALE_RANGE = 0.8, 2.4  # scales of augmented examples; includes voxels.SCALES
+MAX_RELIEF = 0.012  # largest height of waves added to surfaces [camera distances]
+LONG_REACH = 0.12  # length scale of distant pairs of voxels [camera distances]
 
 
 def find_examples(folders: Sequence[Path]) -> list[Path]:
-    """Files of observations in the scenes of the folders; reconstructed scenes are compared with their truth first.
+    """Files of labelled observations in scene folders; reconstructions without labels are labelled first.
 
     Raises InputError if there are none.
     """
@@ -49,17 +49,17 @@ def find_examples(folders: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Targets:
-    """What the network should say about the voxels of an example."""
+    """Training targets for the voxels of an example."""
 
     grid: VoxelGrid
-    labels: Int[Tensor, "v"]  # of the majority of surfels: -1 floater or clutter, 0 surface, 1... objects
-    classes: Int[Tensor, "v"]  # of CLASSES
+    labels: Int[Tensor, "v"]  # majority label of the surfels: -1 floater or clutter, 0 surface, 1... objects
+    classes: Int[Tensor, "v"]  # index in CLASSES
     offsets: Float[Tensor, "v 3"]  # to the centre of the object; 0 elsewhere
-    pairs: Int[Tensor, "e 2"]  # of voxels that are not both surface, at least one of them an object's
+    pairs: Int[Tensor, "e 2"]  # pairs of voxels, none of them surface and at least one of an object
 
 
 def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
-    """The example turned, mirrored, scaled, tilted, thinned, shaken, and in other colours."""
+    """The example rotated, mirrored, scaled, tilted, thinned, with noise and in other colours."""
     s, labels = _repainted(example.surfels, example.labels, rng), example.labels
     keep = _with_holes(s, rng)
     s, labels = _with_floaters(s[keep], labels[keep], rng)
@@ -69,7 +69,7 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
     lean = np.array([[1, 0, tilt[0]], [0, 1, tilt[1]], [-tilt[0], -tilt[1], 1]])
     R = torch.from_numpy(lean @ turn).float()
     scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
-    if _longest(s.points, labels) > MAX_SIZE:  # such scenes are also segmented at reduced size
+    if _longest(s.points, labels) > MAX_SIZE:  # such scenes are also segmented at a reduced size
         scale *= float(rng.choice(REDUCTIONS))
     points = scale * s.points @ R.mT + torch.tensor([0, 0, float(rng.normal(0, 0.004))])
     points = points + 0.004 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=points.shape)).float()
@@ -86,14 +86,14 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
 
 
 def _longest(points: Float[Tensor, "n 3"], labels: Int[Tensor, "n"]) -> float:
-    """Longest side along the axes of the largest object [camera distance]; without the outermost 2 % of its points."""
+    """Longest axis-aligned side of the largest object [camera distances], without the outermost 2 % of its points."""
     count = torch.bincount(labels.clamp_min(0))
     parts = [points[labels == k] for k in torch.nonzero(count >= 20)[:, 0].tolist() if k]
     return max((float((p.quantile(0.99, 0) - p.quantile(0.01, 0)).max()) for p in parts), default=0.0)
 
 
 def _repainted(s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generator) -> ScenePoints:
-    """Some objects in parts of other colours, divided by planes: an edge of colour need not part two objects."""
+    """Recolour parts of some objects, divided by planes, since a colour edge need not separate two objects."""
     if rng.uniform() < 0.4:
         return s
     lab, share = s.lab.clone(), rng.uniform(0, 0.8)
@@ -110,7 +110,7 @@ def _repainted(s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generato
 
 
 def _with_holes(s: ScenePoints, rng: np.random.Generator) -> Bool[Tensor, "n"]:
-    """Which surfels stay when round patches and a share of the rest are missing."""
+    """Mask of the surfels that remain after removing round patches and a random fraction of the rest."""
     keep = torch.from_numpy(rng.uniform(size=len(s)) < rng.choice([1.0, 1.0, 0.8, 0.5]))
     for middle in s.points[torch.from_numpy(rng.integers(0, len(s), rng.integers(0, 12)))]:
         keep &= (s.points - middle).norm(dim=1) > float(rng.uniform(0.01, 0.12))
@@ -120,7 +120,7 @@ def _with_holes(s: ScenePoints, rng: np.random.Generator) -> Bool[Tensor, "n"]:
 def _with_floaters(
     s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generator
 ) -> tuple[ScenePoints, Int[Tensor, "n"]]:
-    """The surfels and up to MAX_FLOATERS clouds of points of any colour that belong to nothing."""
+    """The surfels with up to MAX_FLOATERS clouds of floaters of random colour."""
     clouds, parts = int(rng.integers(0, MAX_FLOATERS + 1)), []
     for _ in range(clouds):
         n = int(np.exp(rng.uniform(3, 6.5)))
@@ -137,14 +137,14 @@ def _with_floaters(
 
 
 def _relief(xy: Float[Tensor, "n 2"], rng: np.random.Generator) -> Float[Tensor, "n 1"]:
-    """Waves that a reconstruction adds to surfaces, up to MAX_RELIEF high."""
+    """Height of waves as reconstructions add to surfaces, up to MAX_RELIEF."""
     waves = torch.from_numpy(rng.normal(size=(2, 4)) * rng.uniform(4, 40, 4)).float()
     phase = torch.from_numpy(rng.uniform(0, 6.3, 4)).float()
     return MAX_RELIEF * float(rng.uniform()) ** 2 * torch.sin(xy @ waves + phase).mean(1, keepdim=True)
 
 
 def targets(surfels: ScenePoints, labels: Int[Tensor, "n"], shift: Float[Tensor, "3"] | None = None) -> Targets:
-    """Voxels and what they should be; tiny objects count as clutter."""
+    """The voxels and their targets; tiny objects count as clutter."""
     grid = voxelise(surfels, shift)
     numbers = labels + 1
     count = torch.zeros(len(grid), int(numbers.max()) + 1 if len(numbers) else 1)
@@ -160,7 +160,7 @@ def targets(surfels: ScenePoints, labels: Int[Tensor, "n"], shift: Float[Tensor,
 
 
 def joined(parts: Sequence[Targets]) -> Targets:
-    """Several scenes as one, far apart, with their own object numbers."""
+    """Several scenes as one, placed far apart, with distinct object numbers."""
     if len(parts) == 1:
         return parts[0]
     shifts = [torch.tensor([APART * k, 0, 0]) for k in range(len(parts))]
@@ -179,7 +179,7 @@ def joined(parts: Sequence[Targets]) -> Targets:
 
 
 def with_pairs(t: Targets, rng: np.random.Generator) -> Targets:
-    """The targets with at most MAX_PAIRS random pairs of voxels to be judged."""
+    """The targets with at most MAX_PAIRS random pairs of voxels for the affinity loss."""
     kept = t.classes != 0
     pairs = voxel_pairs(neighbour_table(t.grid.cells), t.grid.points, rng, 1)
     pairs = pairs[kept[pairs[:, 0]] & kept[pairs[:, 1]]]
@@ -190,7 +190,7 @@ def with_pairs(t: Targets, rng: np.random.Generator) -> Targets:
 def voxel_pairs(
     neighbours: Int[Tensor, "v 27"], points: Float[Tensor, "v 3"], rng: np.random.Generator, distant: int
 ) -> Int[Tensor, "e 2"]:
-    """All pairs of adjacent voxels, and about `distant` times as many voxels' pairs up to LONG_REACH apart."""
+    """All pairs of adjacent voxels, and about `distant` random pairs per voxel up to twice LONG_REACH apart."""
     i, k = torch.nonzero(neighbours[:, :13] < len(points), as_tuple=True)
     near = torch.stack([i, neighbours[i, k]], 1)
     if not distant or len(points) < 2:

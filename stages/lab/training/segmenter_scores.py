@@ -20,16 +20,18 @@ from stages.core.models.segmenter.voxels import SCALES, VoxelGrid, voxelise
 from stages.lab.clutter.examples import read_example
 from stages.lab.training.segmenter_data import augmented
 
-BATCH, RATE = 512, 3e-3
-LARGE, GOOD = 20, 0.3  # voxels and IoU of candidates that a third of each batch has at least: most are small and bad
-MIN_SURFELS = 60  # of a true object that counts
-FLOATER_WEIGHT = 0.3  # of surfels without a true label, in the size of a candidate
-MAX_SURFELS = 160_000
-JITTER = 0.05  # of the normalised features
+BATCH, RATE = 512, 3e-3  # candidates of each kind per step, and maximum learning rate
+# Candidates with at least this many voxels, and with at least this IoU, each make up a third of a batch, since most
+# candidates are small and bad.
+LARGE, GOOD = 20, 0.3
+MIN_SURFELS = 60  # smallest number of surfels of a true object
+FLOATER_WEIGHT = 0.3  # weight of surfels without a true label in the size of a candidate
+MAX_SURFELS = 160_000  # largest number of surfels of an example
+JITTER = 0.05  # standard deviation of noise added to the normalised features
 
 
 class _Candidates(Dataset):
-    """Features and true IoUs of all candidates of `scenes` augmented examples; None for too many or too few surfels."""
+    """Features and true IoUs of all candidates in `scenes` augmented examples; None if their size is unsuitable."""
 
     def __init__(self, model: Segmenter, files: Sequence[Path], scenes: int, seed: int):
         self.model, self.files, self.scenes, self.seed = model, list(files), scenes, seed
@@ -53,7 +55,7 @@ class _Candidates(Dataset):
 def fit_scores(
     model: Segmenter, files: Sequence[Path], scenes: int, steps: int, seed: int, workers: int = 0
 ) -> dict[str, float]:
-    """Train `model.score`, in place, on the candidates in `scenes` augmented examples; returns figures for the card.
+    """Train `model.score` in place on the candidates in `scenes` augmented examples; return figures for the card.
 
     The examples are prepared by `workers` processes; the result does not depend on their number.
     """
@@ -71,7 +73,7 @@ def fit_scores(
 
 
 def _train(model: Segmenter, x: Float[Tensor, "k f"], y: Float[Tensor, "k"], steps: int) -> float:
-    """The loss of the last hundred steps."""
+    """Train the score head; return the mean loss of the last hundred steps."""
     optimiser = torch.optim.AdamW(model.candidate_head.parameters(), RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     groups = [torch.arange(len(x)), torch.nonzero(x[:, 0].exp() >= LARGE)[:, 0], torch.nonzero(y > GOOD)[:, 0]]
@@ -89,7 +91,7 @@ def _train(model: Segmenter, x: Float[Tensor, "k f"], y: Float[Tensor, "k"], ste
 
 
 def true_iou(found: Candidates, grid: VoxelGrid, labels: Int[Tensor, "n"]) -> Float[Tensor, "k"]:
-    """IoU of each candidate with the true object that it fits best, in surfels."""
+    """IoU of each candidate with the best-fitting true object, in surfels."""
     count = int(labels.max()) + 1 if len(labels) else 1
     judged, total = labels >= 0, torch.bincount(grid.owner, minlength=len(grid)).double()
     known = torch.bincount(grid.owner[judged], minlength=len(grid)).double()

@@ -1,4 +1,4 @@
-"""Training scenes of the splat head: folders of posed photos, and Gaussian scenes, which are rendered."""
+"""Training scenes of the splat head: folders of posed photos, and renderings of Gaussian scenes."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from stages.reconstruct.network_input import make_batch, network_size
 from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import undistort
 
-CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")
-PHOTO_FOLDERS = ("photos", "images", ".")
+CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")  # camera files that are looked for, in this order
+PHOTO_FOLDERS = ("photos", "images", ".")  # photo folders that are looked for, in this order
 HELD_OUT_EVERY = 4  # every n-th view of a scene is held out from training
-ORBIT_VIEWS = 24  # rendered views of a scene without cameras
-WHITE = (1.0, 1.0, 1.0)  # background, as in the published renderer
+ORBIT_VIEWS = 24  # number of rendered views of a scene without cameras
+WHITE = (1.0, 1.0, 1.0)  # background colour, as in the published renderer
 
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Views of one scene with their cameras, all of one size, with sides that are multiples of 14 px."""
+    """Views of one scene with their cameras, all of one size whose sides are multiples of 14 px."""
 
     name: str
     images: Float[Tensor, "v 3 h w"]
     viewmats: Float[Tensor, "v 4 4"]
     Ks: Float[Tensor, "v 3 3"]
-    depths: Float[Tensor, "v h w"] | None  # true depth, 0 where there is no surface; None for photos
+    depths: Float[Tensor, "v h w"] | None  # true depth, 0 in empty pixels; None for photos
 
     def __getitem__(self, index: list[int]) -> PosedViews:
         depths = None if self.depths is None else self.depths[index]
@@ -49,7 +49,7 @@ class PosedViews:
 
     @property
     def held(self) -> list[int]:
-        """Indices of the views that are held out for validation."""
+        """Indices of the views held out for validation."""
         return list(range(HELD_OUT_EVERY // 2, len(self.images), HELD_OUT_EVERY))
 
     @property
@@ -59,9 +59,9 @@ class PosedViews:
 
 
 def read_training_scenes(folder: Path, side: int, device: str = "cpu") -> list[PosedViews]:
-    """Every scene in a folder, in order of name: NAME.ply, and folders (or this one) with photos and their cameras.
+    """Read all scenes in a folder: folders with photos and cameras (or this one), then NAME.ply, each in name order.
 
-    `side` is the longest side of an image [px]. Raises InputError where there is no scene or one has too few views.
+    `side` is the longest side of an image [px]. Raises InputError if there are no scenes, or one has too few views.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -106,7 +106,7 @@ def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c
 
 
 def render_views(name: str, scene: Scene, side: int, device: str = "cpu") -> PosedViews:
-    """Render a scene from its own cameras, or from two rings around it where it has fewer than 4."""
+    """Render a scene from its own cameras, or from two rings around it if it has fewer than 4."""
     cameras = scene.cameras if scene.cameras is not None and len(scene.cameras) >= 4 else default_cameras(scene)
     size = network_size(*cameras.sizes[0].tolist(), side)
     Ks = _resized(cameras, [size] * len(cameras))

@@ -1,4 +1,4 @@
-"""State of a training run: model, averaged weights, optimizer, curve; saved to and read from checkpoints."""
+"""State of a training run: model, averaged weights, optimizer and curve; saved to and loaded from checkpoints."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from stages.core.scene.files import must_exist, save_tensors
 
 EMA_DECAY = 0.999  # of the exponential moving average of the weights, after a few thousand steps
 GRADIENT_CLIP = 2.0  # gradients are clipped to this multiple of the moving average of their norm
-GRADIENT_NORM_DECAY = 0.99  # of that moving average
+GRADIENT_NORM_DECAY = 0.99  # of the moving average of the gradient norm
 WARMUP_STEPS = 200  # steps until the full learning rate
-DIVERGENCE_RATIO = 1.25  # training has diverged at this multiple of the lowest RMSE so far,
-MAX_WORSENING_CHECKS = 4  # or when this many consecutive validations were each worse than the one before
+DIVERGENCE_RATIO = 1.25  # training has diverged if the RMSE is this multiple of the lowest so far
+MAX_WORSENING_CHECKS = 4  # training has diverged if this many consecutive validations were each worse than the last
 
 
 class TrainingState:
-    """A model in training, with everything that a checkpoint has to hold."""
+    """A model in training, with everything that a checkpoint has to store."""
 
     def __init__(self, model: Dynamics, lr: float, seed: int, optimizer: str = "adamw"):
         self.model = model.train()
@@ -34,15 +34,15 @@ class TrainingState:
         self.gradient_norm = self.params[0].new_zeros(())  # moving average; 0: none yet
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.elapsed, self.curve = 0, 0.0, []
-        self.losses: list[Tensor] = []  # since the last row of the curve
-        self.skipped = self.params[0].new_zeros(())  # steps without finite gradients since then
-        self.rate_factor, self.warmup_start = 1.0, 0  # halved on divergence; step at which the rate rises from 0
-        self.horizon = 0  # frames of the rollouts that the optimizer's moments are of
+        self.losses: list[Tensor] = []  # losses since the last row of the curve
+        self.skipped = self.params[0].new_zeros(())  # number of steps with non-finite gradients since then
+        self.rate_factor, self.warmup_start = 1.0, 0  # halved on divergence; step at which the warm-up starts
+        self.horizon = 0  # rollout length to which the optimizer's moments belong [frames]
         self.previous_step: torch.cuda.Event | None = None
 
     @torch.no_grad()
     def update(self, grads: list[Tensor], lr: float) -> None:
-        """One optimizer step with clipped gradients; nothing changes where they are not finite."""
+        """One optimizer step with clipped gradients; parameters stay unchanged if the gradients are not finite."""
         norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(grads)))
         finite = norm.isfinite()
         norm = torch.where(finite, norm, 0.0)
@@ -63,7 +63,8 @@ class TrainingState:
         self.step += 1
         keep = min(EMA_DECAY, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(list(self.ema.parameters()), list(self.model.parameters()), 1 - keep)
-        if self.gradient_norm.is_cuda:  # the host runs at most one step ahead, so that its clock measures the GPU's
+        # let the host run at most one step ahead, so that its clock measures the time of the GPU
+        if self.gradient_norm.is_cuda:
             if self.previous_step is not None:
                 self.previous_step.synchronize()
             self.previous_step = torch.cuda.Event()
@@ -72,8 +73,8 @@ class TrainingState:
     def record(self, row: dict) -> None:
         """Append a validation to the curve; keep the weights if they have the lowest RMSE so far.
 
-        On divergence training continues from the best weights at half the learning rate: the gradients of long rollouts
-        can explode.
+        On divergence, which exploding gradients of long rollouts can cause, training continues from the best weights at
+        half the learning rate.
         """
         mean = torch.stack(self.losses).nanmean().item() if self.losses else math.nan
         row = {"minutes": self.elapsed / 60, "step": self.step, "loss": mean, "rate_factor": self.rate_factor,
@@ -98,7 +99,7 @@ class TrainingState:
         self._reset_moments()
 
     def start_horizon(self, horizon: int) -> None:
-        """Prepare for rollouts of `horizon` frames: their gradients differ in size, so moments and warm-up restart."""
+        """Prepare for rollouts of `horizon` frames: gradients change in size, so moments and warm-up restart."""
         if self.horizon not in (0, horizon):
             self._reset_moments()
         self.horizon = horizon
@@ -107,7 +108,7 @@ class TrainingState:
         self.warmup_start = self.step
         self.gradient_norm.zero_()
         for moments in self.optimizer.state.values():
-            for name in ("exp_avg", "exp_avg_sq", "step"):  # SOAP's eigenvectors stay
+            for name in ("exp_avg", "exp_avg_sq", "step"):  # SOAP's eigenvectors are kept
                 if name in moments:
                     moments[name].zero_()
 
@@ -116,13 +117,13 @@ class TrainingState:
         return min(self.curve, key=lambda r: r["RMSE"])
 
     def best_model(self) -> Dynamics:
-        """The averaged weights of that row, as a model."""
+        """A model with the averaged weights of the best row."""
         model = copy.deepcopy(self.ema)
         model.load_state_dict(self.best)
         return model
 
     def save(self, path: Path, key: dict) -> None:
-        """Write a checkpoint; `key` identifies the training it belongs to."""
+        """Write a checkpoint; `key` identifies the training to which it belongs."""
         state = {
             "key": key, "model": self.model.state_dict(), "ema": self.ema.state_dict(), "best": self.best,
             "optimizer": self.optimizer.state_dict(), "gradient_norm": self.gradient_norm,
@@ -134,23 +135,23 @@ class TrainingState:
         save_tensors(path, state)
 
     def load(self, path: Path, key: dict) -> None:
-        """Resume from a checkpoint. Raises InputError for one that is damaged or of another training."""
+        """Resume from a checkpoint. Raises InputError if it is damaged or belongs to another training."""
         must_exist(path, "the checkpoint of a training to go on with")
         try:
             state = torch.load(path, map_location=self.gradient_norm.device, weights_only=True)
             different = [k for k in key if state["key"].get(k) != key[k]]
             if not different:
                 self._take(state)
-        except torch.cuda.OutOfMemoryError:  # not the file's fault
+        except torch.cuda.OutOfMemoryError:  # not caused by the file
             raise
-        except Exception as error:  # a damaged pickle raises anything, and so do values of other types
+        except Exception as error:  # damaged pickles and values of wrong types raise arbitrary exceptions
             raise InputError(f"{path}: cannot be read as a checkpoint of a training; start anew") from error
         if different:
             raise InputError(f"{path}: was made with another {', '.join(different)}; go on with the same, or start "
                              "anew")  # fmt: skip
 
     def _take(self, state: dict) -> None:
-        """Go on from what `save` wrote."""
+        """Restore the state written by `save`."""
         self.model.load_state_dict(state["model"])
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])

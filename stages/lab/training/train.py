@@ -1,4 +1,4 @@
-"""Training of a dynamics model: motions in, weights and their card out."""
+"""Training of a dynamics model: reads motions, writes weights and their card."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ PROGRESS_LINE = (
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
 SPARSE_EVERY = 4  # with --sparse-keypoints, every fourth step uses fewer keypoints
-VALIDATION_FRAMES = 80  # of the rollouts that select the weights
-SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # of the selected weights, in a card
+VALIDATION_FRAMES = 80  # length of the rollouts that select the weights
+SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # scores of the selected weights that are stored in the card
 
 
 def run(
     model: str, data: Path, out: Path, options: TrainOptions, resume: bool = False,
     start: Path | None = None,
 ) -> list[str]:  # fmt: skip
-    """Train on groups of motions; write the best weights to OUT and their card next to it. Returns lines of result.
+    """Train on groups of motions; write the best weights to OUT and their card next to it. Returns lines of results.
 
-    OUT with the suffix .ckpt is the checkpoint that `resume` continues from; with the same options the curve is the
-    same as without the interruption. `start` are weights to begin with; their runs come first in the new card. Raises
-    InputError for missing or unfit files.
+    OUT with the suffix .ckpt is the checkpoint from which `resume` continues; with the same options the curve is the
+    same as without the interruption. `start` holds initial weights, whose runs come first in the new card. Raises
+    InputError for missing or unsuitable files.
     """
     out = Path(out)
     if not out.parent.is_dir():
@@ -91,14 +91,14 @@ def run(
 
 
 def _with_sparse(motions: KeypointMotions, count: int) -> list[KeypointMotions]:
-    """The motions, and a copy with `count` keypoints per object if that is not 0."""
+    """The motions, followed by a copy with `count` keypoints per object unless `count` is 0."""
     return [motions, replace(motions, points=motions.points[:, :, :, :count].clone())] if count else [motions]
 
 
 def _initial_state(
     model: str, options: TrainOptions, device: str, start: Path | None
 ) -> tuple[TrainingState, list[dict]]:
-    """A model that is new or has the weights `start`; and the earlier runs of these weights."""
+    """A new model, or one with the weights `start`, and the earlier runs of these weights."""
     torch.manual_seed(options.seed)
     earlier = []
     if start is None:
@@ -115,17 +115,17 @@ def _initial_state(
 
 
 def _key(model: str, options: TrainOptions, earlier: list[dict], sums: dict[str, str]) -> dict:
-    """Settings and checksums of the data that must be equal for training to resume from a checkpoint."""
+    """Settings and checksums that must be equal to resume training from a checkpoint."""
     start = earlier[-1]["sha256"] if earlier else None
     return {"model": model, "from": start, "data": sums, **{k: v for k, v in asdict(options).items() if k != "device"}}
 
 
 @dataclass
 class TrainingRun:
-    """One run of training, by one process or several."""
+    """One training run, by one or several processes."""
 
     state: TrainingState
-    samplers: list[ClipSampler]  # with all keypoints; with fewer, for every fourth step, if asked for
+    samplers: list[ClipSampler]  # with all keypoints, optionally followed by one with fewer for every fourth step
     validation: KeypointMotions
     options: TrainOptions
     processes: ProcessGroup
@@ -133,7 +133,7 @@ class TrainingRun:
     key: dict
 
     def run(self) -> bool:
-        """Train until the budget is used up (True) or the process is asked to terminate (False)."""
+        """Train until the budget is used up (returns True) or the process is asked to terminate (False)."""
         state, options, part = self.state, self.options, self.processes.rows(self.options.batch)
         self.clock = time.perf_counter() - state.elapsed
         losses, horizon, done = [], 0, self.progress()
@@ -144,14 +144,14 @@ class TrainingRun:
         ):
             while done < 1 and not self.processes.broadcast(len(requests)):
                 if options.horizon(done) != horizon:
-                    losses, horizon = [], options.horizon(done)  # frees the memory of the old CUDA graphs first
+                    losses, horizon = [], options.horizon(done)  # first free the memory of the old CUDA graphs
                     losses = [self.rollout_loss(sampler) for sampler in self.samplers]
                     state.start_horizon(horizon)
                 i = -1 if state.step % SPARSE_EVERY == 0 else 0
                 loss, grads = losses[i](self.samplers[i].draw(options.batch, horizon, state.generator, part))
                 *grads, loss = self.processes.mean([*grads, loss])
                 state.update(grads, options.rate(done))
-                state.losses.append(loss.clone())  # a CUDA graph writes the next loss to the same memory
+                state.losses.append(loss.clone())  # the CUDA graph will overwrite the memory of the loss
                 before, done = done, self.progress()
                 if math.floor(done * options.checks) > math.floor(before * options.checks):
                     self.check(horizon)
@@ -193,7 +193,7 @@ class TrainingRun:
 
 @contextmanager
 def _termination_requests():
-    """A list that is no longer empty once the process gets SIGTERM, as `timeout` sends it."""
+    """A list that becomes non-empty when the process receives SIGTERM, for example from `timeout`."""
     requests: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, _: requests.append(number))
     try:
@@ -204,7 +204,7 @@ def _termination_requests():
 
 @contextmanager
 def _tf32_matmul(device: str):
-    """On a GPU, matrix products in TF32: the rounding is far below the noise of a batch."""
+    """Use TF32 for matrix products on a GPU: its rounding error is far below the noise of a batch."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if device == "cuda" else before)
     try:
@@ -217,7 +217,7 @@ def _tf32_matmul(device: str):
 def validate(
     model: torch.nn.Module, scenes: KeypointMotions, frames: int = VALIDATION_FRAMES, batch: int = 100
 ) -> dict[str, float]:
-    """Metrics of full rollouts from rest, averaged over the scenes; inf as RMSE where any scene's is not finite."""
+    """Metrics of full rollouts from rest, averaged over the scenes; the RMSE is inf if any scene's is not finite."""
     model.eval()
     frames = min(frames, scenes.points.shape[1])
     world, rows = scenes.initial_conditions(), []

@@ -34,8 +34,8 @@ from stages.lab.training.segmenter_data import (
 )
 from stages.lab.training.segmenter_scores import fit_scores
 
-CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])
-REPORT_STEPS = 50
+CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])  # weights of surface, object and clutter in the class loss
+REPORT_STEPS = 50  # steps between progress reports
 
 
 def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:
@@ -61,7 +61,7 @@ def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:
 class Crops(IterableDataset):
     """Endless batches of targets: augmented examples of random files, cropped to about `voxels` around an object.
 
-    Every worker of a `DataLoader`, and every process `rank`, draws others.
+    Every worker of a `DataLoader` and every process `rank` draws different ones.
     """
 
     def __init__(self, files: Sequence[Path], voxels: int, batch: int, seed: int, rank: int = 0):
@@ -95,10 +95,10 @@ def run(
 ) -> Iterator[str]:
     """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
 
-    `score_folders`: scenes whose candidates train the scores, in place of `folders`; on scenes that the network was
-    trained on, candidates fit better than on others. `start`: weights to continue from, with the widths and blocks of
-    their card; scores of candidates by other features than today's begin anew. Under `torchrun` every process draws
-    its own crops, and the gradients are averaged.
+    `score_folders` are scenes whose candidates train the scores, instead of `folders`: on scenes that the network was
+    trained on, candidates fit better than on others. `start` holds initial weights, with the widths and blocks of their
+    card; scores based on other candidate features than the current ones are initialised anew. Under `torchrun` every
+    process draws its own crops, and the gradients are averaged.
     """
     torch.manual_seed(options.seed)
     files, score_files = find_examples(folders), find_examples(score_folders or folders)
@@ -125,9 +125,9 @@ def fit_network(
     curve: list[dict],
     change: Callable[[Targets], Targets] = lambda t: t,
 ) -> Iterator[str]:
-    """Train all but the scores, in place; appends to `curve` and yields a line every REPORT_STEPS steps.
+    """Train everything but the scores, in place; append to `curve` and yield a line every REPORT_STEPS steps.
 
-    `change`: of each batch before its losses, for ablations.
+    `change` is applied to each batch before its losses, for ablations.
     """
     trained = [p for name, p in model.named_parameters() if not name.startswith(SCORES)]
     optimiser = torch.optim.AdamW(trained, options.rate, weight_decay=0.01)
@@ -157,7 +157,7 @@ def fit_network(
 
 
 def _progress(options: SegmenterTraining, step: int, begun: float) -> float:
-    """Share of the training that is done."""
+    """Completed fraction of the training."""
     if not options.minutes:
         return 1.0
     return step / options.steps if options.steps else (time.monotonic() - begun) / (60 * options.minutes)
@@ -166,7 +166,7 @@ def _progress(options: SegmenterTraining, step: int, begun: float) -> float:
 def _save(
     out: Path, model: Segmenter, options: SegmenterTraining, files: int, curve: list[dict], scores: dict | None = None
 ) -> None:
-    """Weights in half precision, and their card."""
+    """Write the weights in half precision, and their card."""
     with replacing(Path(out)) as part:
         save_file({k: v.detach().cpu().contiguous().half() for k, v in model.state_dict().items()}, part)
     card = {"model": "segmenter", "config": model.config, "sha256": sha256(out), "training": asdict(options),

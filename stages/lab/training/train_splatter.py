@@ -1,8 +1,9 @@
-"""Training of Pi3-splat's Gaussian head; the parts that estimate points and cameras stay fixed.
+"""Training of Pi3-splat's Gaussian head, with the parts that estimate points and cameras frozen.
 
-Gaussians are predicted from some views of a scene and rendered in these and in another view. The loss compares renders
-with the photos, and rendered depth with the depth of the Gaussians. Source: Li et al. 2026, "Learning physics-grounded
-4D dynamics with neural Gaussian force fields", section on reconstruction (its training code is not public).
+Gaussians are predicted from some views of a scene and rendered in one of these and in another view. The loss compares
+renderings with the photos, and rendered depth with the depth of the Gaussians. Source: Li et al. 2026, "Learning
+physics-grounded 4D dynamics with neural Gaussian force fields", section on reconstruction (its training code is not
+public).
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from stages.lab.training.options import SplatterOptions
 from stages.lab.training.splatter_data import WHITE, PosedViews, read_training_scenes
 from stages.reconstruct.depth import unproject
 
-SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM (the rest is L1) and of the relative depth error
-CHECKS = 10  # validations in a run
-TRAINED_MODULES = ("feature_decoder", "feature_head")
+SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM (L1 has the rest) and of the relative depth error
+CHECKS = 10  # number of validations in a run
+TRAINED_MODULES = ("feature_decoder", "feature_head")  # modules of the Gaussian head
 
 
 def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = None) -> Iterator[str]:
@@ -80,7 +81,7 @@ def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = 
 def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:
     """The network with only the Gaussian head trainable, and whether that head is untrained.
 
-    Weights are those of Pi3-splat, or of π³ where there are none.
+    Weights are those of Pi3-splat, or of π³ if there are none.
     """
     fresh = True
     if options.width:
@@ -92,7 +93,7 @@ def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Spl
         except InputError:
             base = load(find("pi3", weights), "pi3")
             model = Pi3Splat(base.config)
-            model.encoder.load_state_dict(base.state_dict(), strict=False)  # without the Gaussian head
+            model.encoder.load_state_dict(base.state_dict(), strict=False)  # lacks the Gaussian head
     for name, parameter in model.encoder.named_parameters():
         parameter.requires_grad_(name.startswith(TRAINED_MODULES))
     return model.eval(), fresh
@@ -112,7 +113,7 @@ def initialise_head(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]
 def fit(
     model: Pi3Splat, training: list[PosedViews], held_out: list[PosedViews], options: SplatterOptions, device: str
 ) -> Iterator[dict]:
-    """Train and yield validations {"step", "loss", "psnr"}, the first before any step."""
+    """Train and yield validations {"step", "loss", "psnr"}, the first one before training."""
     generator = torch.Generator().manual_seed(options.seed)
     learned = [p for p in model.parameters() if p.requires_grad]
     optimiser = torch.optim.AdamW(learned, options.lr, weight_decay=0.01)
@@ -165,12 +166,12 @@ def held_out_psnr(model: Pi3Splat, scene: PosedViews, options: SplatterOptions, 
 
 
 def _autocast(device: torch.device) -> torch.autocast:
-    """The network runs in bfloat16 on a GPU; geometry needs single precision."""
+    """Autocast to bfloat16 on a GPU, for the network only; geometry needs single precision."""
     return torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu")
 
 
 def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
-    """3D points of the source views' pixels, and renders of their Gaussians in the target views."""
+    """3D points of the source views' pixels, and renderings of their Gaussians in the target views."""
     device = views.images.device
     used = views[sources]
     with _autocast(device):
@@ -186,7 +187,7 @@ def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], opt
 
 @torch.no_grad()
 def view_geometry(model, views: PosedViews, options: SplatterOptions, hidden=None, positions=None) -> Geometry:
-    """3D points of all pixels at the given cameras, with true or predicted depth, scaled to the given cameras."""
+    """3D points of all pixels in the given cameras, from true depth, or predicted depth scaled to these cameras."""
     if options.depth == "given":
         depths = views.depths
     else:

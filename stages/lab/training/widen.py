@@ -1,4 +1,4 @@
-"""Function-preserving widening: a wider force field with the same outputs as a narrower, trained one."""
+"""Function-preserving widening: a wider force field with the same outputs as a trained, narrower one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.core.models.field.force_field import ForceField
 
 @torch.no_grad()
 def widen(model: ForceField, hidden: int) -> ForceField:
-    """The same function with `hidden` channels, as a start for further training.
+    """A force field with `hidden` channels that computes the same function, as a start for further training.
 
     New channels have random input weights and zero output weights. Raises InputError for fewer channels than before.
     """
@@ -34,7 +34,7 @@ def widen(model: ForceField, hidden: int) -> ForceField:
 def _old_channels(before: int, after: int, old: int, new: int) -> torch.Tensor:
     """Indices of the old channels along an axis that grew from `before` to `after` entries.
 
-    The axis holds blocks of `old` channels, now `new` each, then entries that do not depend on the width.
+    The axis consists of blocks of `old` channels, now `new` each, followed by entries that do not depend on the width.
     """
     blocks = (after - before) // (new - old) if new > old else 0
     inner = (torch.arange(blocks)[:, None] * new + torch.arange(old)).flatten()

@@ -1,1 +1,1 @@
-"""Objects, backgrounds and scenes made in code."""
+"""Procedural objects, backgrounds and scenes, and conversion of meshes to Gaussians."""

@@ -12,7 +12,7 @@ from stages.lab.assets.paint import RGB, mix, overlay, plain
 from stages.lab.assets.shapes import noise
 
 PlanePoints = Float[Tensor, "n 2"]  # [m]
-TABLE_EDGE, ROOM_EDGE = 0.02, 0.12  # blur of texture edges, about the spacing of the Gaussians [m]
+TABLE_EDGE, ROOM_EDGE = 0.02, 0.12  # blur width of texture edges, about the spacing of the Gaussians [m]
 
 
 def fractal_noise(q: PlanePoints, size: float, seed: int) -> Float[Tensor, "n"]:
@@ -22,7 +22,7 @@ def fractal_noise(q: PlanePoints, size: float, seed: int) -> Float[Tensor, "n"]:
 
 
 def stretch(q: PlanePoints, along: float) -> PlanePoints:
-    """Coordinates with x divided by `along`, so that a pattern of them is stretched along x."""
+    """Coordinates with x divided by `along`, which stretches a pattern along x."""
     return q * torch.tensor([1 / along, 1.0])
 
 
@@ -36,7 +36,7 @@ def wood_planks(
 ) -> Tensor:
     """Planks of `width` [m] along x with wood grain between a dark and a light colour, random shades and dark joints.
 
-    `edge` is the blur of the joints [m], `spread` the weight of the shades.
+    `edge` is the blur width of the joints [m], `spread` the weight of the shades.
     """
     number = (q[:, 1] / width).floor()
     shade = torch.frac(torch.sin(number * 12.9898 + seed) * 43758.5453).abs()

@@ -18,11 +18,11 @@ from stages.lab.assets.paint import box2
 from stages.lab.assets.shapes import Surface, noise, single_threaded, to_gaussians
 from stages.lab.names import chosen_names
 
-TABLE_HEIGHT, FLOOR_HEIGHT, CEILING_HEIGHT = -0.94, -2.5, 1.7  # heights [m]
-TABLE_HALF_WIDTH, ROOM_HALF_WIDTH = 2.1, 6.6  # half widths of the table and of the room [m]; cameras orbit at 3.8
-TABLE_THICKNESS, LEG_HALF_WIDTH = 0.14, 0.13  # of the table top and half width of a leg [m]
-TABLE_SPACING, ROOM_SPACING = 0.0235, 0.14  # spacing of Gaussians on the table and in the room [m]
-BACKGROUND_PLY = "gaussians_feedforward.ply"
+TABLE_HEIGHT, FLOOR_HEIGHT, CEILING_HEIGHT = -0.94, -2.5, 1.7  # z of table top, floor and ceiling [m]
+TABLE_HALF_WIDTH, ROOM_HALF_WIDTH = 2.1, 6.6  # of the square table and of the room [m]; cameras orbit at 3.8
+TABLE_THICKNESS, LEG_HALF_WIDTH = 0.14, 0.13  # thickness of the table top, and half width of a leg [m]
+TABLE_SPACING, ROOM_SPACING = 0.0235, 0.14  # spacing of Gaussians on the table top, and on floor and walls [m]
+BACKGROUND_PLY = "gaussians_feedforward.ply"  # file name in the folder of a background
 Paint = Callable[[Tensor], Tensor]
 
 
@@ -31,7 +31,7 @@ class Background:
     """Textures and colours of the table, the floor and the walls, and the shape of the table."""
 
     top: Paint
-    wood: tuple[float, float, float]  # of sides and legs
+    wood: tuple[float, float, float]  # colour of sides and legs
     floor: Paint
     wall: Paint
     round: bool = False  # a round table with one leg
@@ -75,7 +75,7 @@ def _known(name: str) -> str:
 
 
 def outline_distance(q: Float[Tensor, "n 2"], b: Background, grow: float = 0.0) -> Float[Tensor, "n"]:
-    """Signed distance to the outline of the table top, enlarged by `grow`, negative inside [m]."""
+    """Signed distance to the outline of the table top enlarged by `grow`; negative inside [m]."""
     return (
         q.norm(dim=1) - 1.15 * TABLE_HALF_WIDTH - grow
         if b.round
@@ -100,7 +100,7 @@ def _sides(b: Background) -> Gaussians:
     angle = torch.arange(0, 2 * torch.pi, 2e-3)
     ray = torch.stack([angle.cos(), angle.sin()], 1)
     far = torch.full((len(angle),), 1.5 * TABLE_HALF_WIDTH)
-    for _ in range(60):  # sphere tracing from outside
+    for _ in range(60):  # sphere tracing towards the outline from outside
         far = far - 0.9 * outline_distance(ray * far[:, None], b)
     line = ray * far[:, None]
     along = torch.cat([torch.zeros(1), (line[1:] - line[:-1]).norm(dim=1).cumsum(0)])
@@ -123,7 +123,7 @@ def _sides(b: Background) -> Gaussians:
 
 
 def _legs(b: Background) -> list[Gaussians]:
-    """Four square legs, or a thick one in the middle."""
+    """Four square legs, or one thick central leg for a round table."""
     step, half = 2.5 * TABLE_SPACING, 0.5 if b.round else LEG_HALF_WIDTH
     at = (
         [(0.0, 0.0)]
@@ -181,7 +181,7 @@ def _walls(b: Background) -> list[Gaussians]:
 
 
 def _daylight(normal: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-    """Brightness of a vertical face by its orientation to the light."""
+    """Brightness of a vertical face, depending on its orientation to the light."""
     return 0.86 + 0.12 * (normal @ torch.tensor([-0.42, -0.9, 0.0]))
 
 
@@ -193,7 +193,7 @@ def _flat(p: Float[Tensor, "n 3"], normal: tuple[float, float, float], rgb: Tens
 def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
     """Write OUT/<name>/gaussians_feedforward.ply for each background, and an image of all to `sheet`.
 
-    `only` names some of them, separated by commas. Yields a line per background; raises InputError for unknown names.
+    `only` restricts them to a comma-separated list. Yields a line per background. Raises InputError for unknown names.
     """
     from stages.core.scene.files import make_folder, provenance
     from stages.core.scene.images import write_jpeg

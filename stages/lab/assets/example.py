@@ -21,8 +21,8 @@ from stages.lab.assets.toys import falling_toys
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
-WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
-WALL = torch.tensor([0.62, 0.66, 0.70])  # background colour
+WIDTH, HEIGHT, FOCAL = 640, 480, 620.0  # of the photos [px]
+WALL = torch.tensor([0.62, 0.66, 0.70])  # background colour of the photos
 
 
 def make_example(out: Path, photos: int = 26) -> None:
@@ -62,7 +62,7 @@ def _transforms(cameras: Cameras) -> dict:
 
 
 def _write_truth(scene: Scene, out: Path) -> None:
-    """Simulate the toys without the table by MPM; of the Gaussians simulated, store every fourth (a small file)."""
+    """Simulate every third Gaussian of the toys by MPM, without the table, and store every fourth of those."""
     toys = scene.gaussians[scene.gaussians.object_id > 0]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "toys.ply"

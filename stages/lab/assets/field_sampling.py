@@ -15,7 +15,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.shapes import Surface, to_gaussians
 from stages.lab.assets.signed_distance import Field, Vec, union
 
-GRID_CELLS = 64  # of the candidate grid, along the longest side
+GRID_CELLS = 64  # cells of the candidate grid along the longest side
 SKY_LIGHT, KEY_LIGHT = (
     torch.tensor([0.0, 0.0, 1.0]),
     torch.nn.functional.normalize(torch.tensor([-0.35, -0.75, 0.85]), dim=0),
@@ -38,7 +38,7 @@ def gaussians_from_parts(
     """n flat Gaussians of SH degree 2 on the union of the parts, normalised to longest side 1.
 
     The union must lie within +-half; `smooth` is the blending width of its creases. A point has the colour and gloss of
-    the nearest part. `skin` is half the width of the band that is sampled, less than half the thinnest wall.
+    the nearest part. `skin` is half the width of the sampled band, less than half the thickness of the thinnest wall.
     Deterministic.
     """
     return normalise_size(sample_parts(parts, half, n, smooth, skin)[0])
@@ -47,7 +47,7 @@ def gaussians_from_parts(
 def sample_parts(
     parts: list[PaintedPart], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """The same before normalisation, and the part that each Gaussian is nearest to."""
+    """As `gaussians_from_parts`, but not normalised, and also the part nearest to each Gaussian."""
     field = union(*(part.field for part in parts), smooth=smooth)
     surface = relax_points(field, sample_surface(field, half, n, skin))
     p = surface.points
@@ -79,10 +79,10 @@ def distance_and_normal(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-
 
 
 def sample_surface(field: Field, half: Vec, n: int, skin: float) -> Surface:
-    """n random points, uniform over the surface of a field whose gradient norm is between 1/2 and 2.
+    """n random points, uniformly distributed over the surface of a field with a gradient norm between 1/2 and 2.
 
-    Points in a thin band of half width `skin` around the surface are projected onto it along the gradient; candidates
-    come only from cells of a coarse grid that the band can intersect.
+    Points in a thin band of half width `skin` around the surface are projected onto it along the gradient. Candidates
+    are drawn only from cells of a coarse grid that the band may intersect.
     """
     generator = torch.Generator().manual_seed(n)
     cell = 2 * max(half) / GRID_CELLS
@@ -108,12 +108,12 @@ def project_to_surface(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) ->
 
 
 def relax_points(field: Field, surface: Surface, rounds: int = 5) -> Surface:
-    """More even spacing: points repel near neighbours on the same side and are projected back onto the surface."""
+    """Even out the spacing: points repel neighbours on the same side and are projected back onto the surface."""
     for last in [False] * (rounds - 1) + [True]:
         p, normal = surface.points, surface.normals
         distance, index = knn(p, p, 8)
         distance, index = distance[:, 1:], index[:, 1:]
-        radius = 1.1 * float(distance[:, 4].median())  # unlike a mean, independent of the number of threads
+        radius = 1.1 * float(distance[:, 4].median())  # unlike a mean, the median does not depend on the thread count
         push = (1 - distance / radius).clamp_min(0) * (normal[:, None] * normal[index]).sum(-1).clamp_min(0)
         away = (p[:, None] - p[index]) / distance.clamp_min(1e-9)[..., None]
         step = 0.35 * radius * (push[..., None] * away).sum(1)
@@ -129,7 +129,7 @@ def diffuse_light(surface: Surface) -> Float[Tensor, "n"]:
 
 
 def ambient_occlusion(field: Field, surface: Surface) -> Float[Tensor, "n"]:
-    """Ambient light factor: 1 on open surfaces, less in creases, from field values along the normal.
+    """Ambient light factor from field values along the normal: 1 on open surfaces, less in creases.
 
     Source: Evans 2006, "Fast approximations for global illumination on dynamic scenes".
     """
@@ -143,13 +143,13 @@ def ambient_occlusion(field: Field, surface: Surface) -> Float[Tensor, "n"]:
 def add_highlight(sh: Float[Tensor, "n 1 3"], normals: Tensor, gloss: Float[Tensor, "n"]) -> Float[Tensor, "n 9 3"]:
     """SH coefficients of degree 2 with a broad white highlight, the reflection of the key light.
 
-    By the addition theorem a lobe f(cos) around direction r has coefficients f_l 4 pi / (2 l + 1) Y_lm(r), where f_l
-    are its Legendre coefficients. SH are evaluated along the viewing direction, so r is the negated reflection.
+    By the addition theorem, a lobe f(cos) around direction r has the coefficients f_l 4 pi / (2 l + 1) Y_lm(r), where
+    f_l are its Legendre coefficients. SH are evaluated along the viewing direction, so r is the negated reflection.
     """
     mirrored = 2 * (normals @ KEY_LIGHT)[:, None] * normals - KEY_LIGHT
     lit = gloss * ((normals @ KEY_LIGHT) * 2).clamp(0, 1)
     weights = torch.tensor([f * 4 * torch.pi / (2 * l + 1) for l, f in enumerate(HIGHLIGHT_LEGENDRE)])
     lobe = basis(-mirrored, 2) * weights[torch.tensor([0, 1, 1, 1, 2, 2, 2, 2, 2])]
     out = torch.nn.functional.pad(sh, (0, 0, 0, 8)) + (lit[:, None] * lobe)[..., None]
-    out[:, 0] -= (lit * HIGHLIGHT_LEGENDRE[0] / C0)[:, None]  # keeps the mean over all views
+    out[:, 0] -= (lit * HIGHLIGHT_LEGENDRE[0] / C0)[:, None]  # keeps the mean over all view directions
     return out

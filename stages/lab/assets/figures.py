@@ -165,7 +165,7 @@ def skirt() -> Field:
 
 def doll_hair() -> list[PaintedPart]:
     """Hair of the doll: a cap with a fringe of pointed locks, black and pink ties, and two tails that end in points."""
-    opening = ellipsoid((0, -0.22, 0.2), (0.172, 0.2, 0.155))  # for the face
+    opening = ellipsoid((0, -0.22, 0.2), (0.172, 0.2, 0.155))  # cut out for the face
     cap = difference(ellipsoid((0, 0.012, 0.27), (0.213, 0.205, 0.19)), opening)
     ends = ((-0.135, 0.17), (-0.08, 0.292), (-0.028, 0.272), (0.028, 0.296), (0.082, 0.276), (0.138, 0.17))
     lines = torch.cat([lock(x, low) for x, low in ends])

@@ -42,14 +42,14 @@ CLOUDS = (
     (3.3, -0.05, 0.85),
     (4.25, 0.08, 0.95),
     (5.3, -0.03, 1.05),
-)  # azimuth [rad], height, size
+)  # clouds on the bowl: azimuth [rad], height, size
 PUFFS = (
     (-0.085, 0.0, 0.034),
     (-0.04, 0.022, 0.046),
     (0.018, 0.034, 0.056),
     (0.068, 0.008, 0.04),
     (0.105, -0.006, 0.026),
-)  # across, up, radius
+)  # circles of a cloud: horizontal offset, vertical offset, radius
 
 
 def clouds(along: Tensor, height: Tensor, radius: float) -> Tensor:
@@ -99,7 +99,7 @@ def can() -> Gaussians:
     def paint(p: Tensor) -> Tensor:
         r, z, azimuth = p[:, :2].norm(dim=1), p[:, 2], torch.atan2(p[:, 0], -p[:, 1])
         rgb = mix((0.62, 0.02, 0.04), (0.84, 0.05, 0.07), (z + 0.4) / 0.7)
-        for side in (0.26, 0.26 + math.pi):  # one of them towards view 0
+        for side in (0.26, 0.26 + math.pi):  # one of the two faces the camera of view 0
             u = torch.remainder(azimuth - side + math.pi, 2 * math.pi) - math.pi
             q = torch.stack([u * 0.262, z], 1)
             crest = -0.2 + 0.07 * torch.sin(u * 2.0 + 0.6)

@@ -1,4 +1,4 @@
-"""Eight held-out objects, never trained on, as signed distance fields.
+"""Eight held-out objects that are never trained on, as signed distance fields.
 
 Ids, Young's moduli and densities are those of GSCollision's held-out objects (source: public code of NGFF); shapes and
 sizes are our own.
@@ -40,7 +40,7 @@ class ShapeKind:
     scale: float  # longest side [m]
     E: float  # [Pa]
     density: float  # [kg/m^3]
-    shape: Callable[[], Field]  # inside the cube of +-0.6, before normalisation to longest side 1
+    shape: Callable[[], Field]  # within a cube of +-0.6, before normalisation to longest side 1
 
 
 def bear() -> Field:
@@ -110,14 +110,14 @@ HELDOUT_SHAPES = {
 
 
 def surface_points(kind: ShapeKind, n: int) -> Float[Tensor, "n 3"]:
-    """`n` evenly spaced points on the surface of a shape, scaled to longest side 1, centred on its bounding box."""
+    """`n` evenly distributed surface points of a shape with longest side 1, centred on its bounding box."""
     return surface_and_interior_points(kind, n, 0.5)[0]
 
 
 def surface_and_interior_points(
     kind: ShapeKind, n: int, spacing: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "m 3"]]:
-    """The surface points, and points of a cubic lattice inside the shape, half a `spacing` deep or more."""
+    """Surface points, and points of a cubic lattice at least half a `spacing` below the surface."""
     field = kind.shape()
     with single_threaded():
         points = relax_points(field, sample_surface(field, (0.6, 0.6, 0.6), n, SURFACE_BAND)).points

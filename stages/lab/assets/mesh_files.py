@@ -1,4 +1,4 @@
-"""Which mesh files belong to which object."""
+"""Grouping of mesh files into objects."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from stages.core.errors import InputError
 
 log = logging.getLogger(__name__)
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")  # in order of preference
-PART_NUMBER = re.compile(r"([ _.-]+|(?<=part)|(?<=piece)|(?<=mesh)|(?<=geom))\d+$", re.IGNORECASE)  # ends a stem
-GENERIC_STEMS = ("mesh", "model", "object", "scene", "textured", "part", "piece", "geom")  # named by their folder
+PART_NUMBER = re.compile(r"([ _.-]+|(?<=part)|(?<=piece)|(?<=mesh)|(?<=geom))\d+$", re.IGNORECASE)  # at the stem's end
+GENERIC_STEMS = ("mesh", "model", "object", "scene", "textured", "part", "piece", "geom")  # the folder names the object
 
 
 def find_objects(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """The files of each object: a mesh file is an object; a folder is searched with its subfolders.
+    """The files of each object; folders are searched recursively, and a file given directly is one object.
 
-    In one folder, files whose names differ only in a number at the end (leg_0.obj, leg_1.obj; part1.obj, part2.obj, but
-    not towel2.obj, towel3.obj) are the parts of one object, and of files that differ only in their suffix the first of
-    MESH_SUFFIXES counts. Raises InputError for a folder without meshes.
+    Within a folder, files whose names differ only in a number at the end (leg_0.obj, leg_1.obj; part1.obj, part2.obj,
+    but not towel2.obj, towel3.obj) are the parts of one object. Of files that differ only in their suffix, the first in
+    the order of MESH_SUFFIXES is used. Raises InputError for a folder without meshes.
     """
     return [files for path in map(Path, paths) for files in (_in_folder(path) if path.is_dir() else [(path,)])]
 
@@ -45,7 +45,7 @@ def _common_stem(path: Path) -> str:
 
 
 def object_name(files: Sequence[Path]) -> str:
-    """Name of the object in these files: their common stem, or that of the folder if the stem is generic (model)."""
+    """Name of the object in these files: their common stem, or the name of the folder if the stem is generic."""
     path = Path(files[0])
     stem = path.stem if len(files) == 1 else _common_stem(path)
     return path.resolve().parent.name or stem if stem.lower() in GENERIC_STEMS else stem

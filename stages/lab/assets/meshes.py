@@ -21,15 +21,15 @@ from stages.lab.assets.winding import winding_signs
 
 UP_ROTATIONS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
            "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}  # fmt: skip
-MIN_AREA = 1e-9  # of all faces, relative to the longest side; less is rounding
+MIN_AREA = 1e-9  # smallest total area of all faces [longest sides^2]; smaller values are rounding errors
 
 
 def read_mesh(files: Path | Sequence[Path], count: int, up: str = "auto", light: bool = True) -> Gaussians:
-    """About `count` flat Gaussians on the faces of an object, z up, centred, longest side 1, object_id 1.
+    """About `count` flat Gaussians on the faces of an object, z up, centred, with longest side 1 and object_id 1.
 
-    The object is all meshes of a file, or of several, in their common coordinates. `up` is the axis that points up
-    (auto: y for glTF, as its standard defines, else z). `light` bakes the soft light of the generated objects into the
-    colours of the file. Raises MissingPackage without trimesh, and InputError when a file cannot be read, has no
+    The object consists of all meshes in the files, in their common coordinates. `up` is the axis that points up
+    (auto: y for glTF, as its standard defines, otherwise z). `light` bakes the soft light of the generated objects into
+    the colours of the file. Raises MissingPackage without trimesh, and InputError if a file cannot be read or has no
     faces, or an argument is invalid.
     """
     files = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
@@ -62,7 +62,7 @@ def _load(path: Path) -> list:
     try:
         scene = trimesh.load_scene(path, process=False)  # processing would merge vertices closer than 1e-8
         meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
-    except Exception as error:  # its readers raise many types
+    except Exception as error:  # trimesh's readers raise many types of exceptions
         raise InputError(f"{path}: cannot be read as a mesh ({error}); export it again") from error
     if not meshes:
         raise InputError(f"{path}: holds no triangles; a mesh with faces is needed (this may be a point cloud)")
@@ -76,7 +76,7 @@ def _load(path: Path) -> list:
 def _sample_faces(files: Sequence[Path], meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """Positions (n, 3), unit normals (n, 3) and colours (n, 3) of about n points, uniform over the faces.
 
-    The bounding box is centred and its longest side 1. Raises InputError, which names `files`, without any area.
+    The bounding box is centred, with longest side 1. Raises InputError naming the first of `files` if there is no area.
     """
     triangles = np.concatenate([np.asarray(mesh.triangles, np.float64) for mesh in meshes])
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
@@ -107,7 +107,7 @@ def _sample_faces(files: Sequence[Path], meshes: list, n: int) -> tuple[Tensor, 
 
 
 def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-    """RGB 0..1 at barycentric points on faces: from face colours, vertex colours, texture or the material."""
+    """RGB 0..1 at barycentric points on faces, from face colours, vertex colours, texture or the material."""
     visual, corner = mesh.visual, torch.from_numpy(np.array(mesh.faces, np.int64))[face]
     if visual.kind == "face":
         return torch.from_numpy(np.array(visual.face_colors[:, :3], np.float32))[face] / 255
@@ -115,19 +115,19 @@ def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Floa
         vertex = torch.from_numpy(np.array(visual.vertex_colors[:, :3], np.float32)) / 255
         return (vertex[corner] * weight[..., None]).sum(1)
     material = getattr(visual, "material", None)
-    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # of glTF, of OBJ
+    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # of glTF and of OBJ
     image = next((image for image in images if image is not None), None)
     if image is None or getattr(visual, "uv", None) is None:
         return _material_colour(material).expand(len(face), 3)
-    uv = np.pad(np.array(visual.uv, np.float32), ((0, 0), (0, 1)))[:, :2]  # OBJ allows u alone
-    uv = torch.from_numpy(np.where(np.abs(uv) < 1e6, uv, 0))  # NaN, as exporters give faces without area, is 0 too
+    uv = np.pad(np.array(visual.uv, np.float32), ((0, 0), (0, 1)))[:, :2]  # OBJ allows u without v
+    uv = torch.from_numpy(np.where(np.abs(uv) < 1e6, uv, 0))  # also replaces NaN, which exporters write for empty faces
     texels = torch.from_numpy(np.array(image.convert("RGB"), np.float32) / 255)
     tint = _material_colour(material) if getattr(material, "baseColorFactor", None) is not None else torch.ones(3)
     return _bilinear_lookup(texels, (uv[corner] * weight[..., None]).sum(1)) * tint
 
 
 def _material_colour(material) -> Float[Tensor, "3"]:
-    """Base or diffuse colour; mid grey when the file has none."""
+    """Base or diffuse colour; mid grey if the file has none."""
     for key in ("baseColorFactor", "diffuse"):
         value = getattr(material, key, None)
         if value is not None:
@@ -137,7 +137,7 @@ def _material_colour(material) -> Float[Tensor, "3"]:
 
 
 def _bilinear_lookup(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
-    """Bilinear texture lookup at (u right, v up), repeating outside 0..1."""
+    """Bilinear texture lookup with u to the right and v up, repeating outside 0..1."""
     h, w = texels.shape[:2]
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     i, j = x.floor(), y.floor()
@@ -149,15 +149,15 @@ def _bilinear_lookup(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -
 
 
 def _poisson_disk_subset(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], count: int) -> Int[Tensor, "n"]:
-    """Indices of a Poisson-disk subset of about `count` points: no two on the same side closer than a radius.
+    """Indices of a Poisson-disk subset of about `count` points: no two on the same side are closer than a radius.
 
-    Parallel dart throwing: in each round every point with the lowest random rank among its remaining neighbours is
-    accepted and its neighbours are rejected, until none is left. In the limit, discs of that diameter cover 0.547 of
-    the area; with five candidates per accepted point they cover about 0.4 (measured), which sets the radius.
+    Parallel dart throwing: in each round, every point with the lowest random rank among its remaining neighbours is
+    accepted and its neighbours are rejected, until none are left. In the limit, discs of that diameter cover 0.547 of
+    the area; with five candidates per accepted point they cover about 0.4 (measured), which determines the radius.
     """
     p, n = points.double().numpy(), normals.numpy()
     tree = cKDTree(p)
-    eighth = np.median(tree.query(p[:: max(1, len(p) // 2000)], k=9)[0][:, 8])  # a disc of this radius holds 8 points
+    eighth = np.median(tree.query(p[:: max(1, len(p) // 2000)], k=9)[0][:, 8])  # a disc of this radius has 8 neighbours
     radius = eighth * np.sqrt(0.4 * 4 / 8 * len(p) / count)
     pairs = tree.query_pairs(radius, output_type="ndarray")
     pairs = pairs[(n[pairs[:, 0]] * n[pairs[:, 1]]).sum(1) > 0]

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ObjectKind:
-    """One object of the data set. Source: paper and public code of NGFF, values of GSCollision."""
+    """An object of the data set. Source: paper and public code of NGFF, values of GSCollision."""
 
     name: str
     id: int  # as in scene_object_idxs
-    scale: float  # scale prior in scenes, relative to the generated object
+    scale: float  # scale prior in scenes, relative to the generated size
     E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
     prompt: str  # text prompt
-    make: str  # module:function
-    side: float = 1.0  # longest side as generated [scene units]
+    make: str  # generator as module:function
+    side: float = 1.0  # longest side of the generated object [scene units]
 
 
 HARD, SOFT, FIGURES, PHONE = (
@@ -40,7 +40,7 @@ OBJECTS = {
     for kind in (
         ObjectKind("ball", 0, 0.4, 8e5, 600.0, "a pokemon ball", f"{HARD}:ball"),
         ObjectKind("bowl", 2, 0.5, 1e7, 800.0, "a blue bowl with cloud", f"{HARD}:bowl"),
-        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a can of 1 m could not be placed
+        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a can of 1 m would be too large to place
         ObjectKind("cloth", 4, 1.0, 3e3, 100.0, "a yellow t-shirt with an owl", f"{SOFT}:cloth"),
         ObjectKind("duck", 7, 0.3, 3e5, 300.0, "a rubber duck", f"{HARD}:duck"),
         ObjectKind("miku", 9, 0.6, 1e5, 400.0, "a hatsune miku", f"{FIGURES}:miku"),
@@ -52,8 +52,8 @@ OBJECTS = {
 }
 
 
-POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"  # in the folder of an object or scene
-ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of the portrait camera for flat objects [deg]
+POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"  # path in the folder of an object or scene
+ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # portrait cameras of flat objects [deg]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ObjectsOptions:
 
 
 def make_object(name: str) -> Gaussians:
-    """An object by name: SH degree 2, object_id 1, bounding box centred on the origin, scale prior not applied.
+    """An object by name: SH degree 2, object_id 1, bounding box centred on the origin, without its scale prior.
 
     Deterministic. Raises InputError for an unknown name.
     """
@@ -91,7 +91,7 @@ def run(
 ) -> Iterator[str]:
     """Write OUT/<name>/ for each object, or for each in `meshes` (files or folders), and an image of all to `sheet`.
 
-    Yields a line per object; raises InputError for unknown names, unreadable meshes or two meshes of one name.
+    Yields a line per object. Raises InputError for unknown names, unreadable meshes, and two meshes with one name.
     """
     from stages.core.scene.files import make_folder, provenance
     from stages.core.scene.images import write_jpeg
@@ -114,7 +114,7 @@ def run(
     for name, files in tqdm(sources.items(), desc="objects", unit="object"):
         g = _from_mesh(files, options) if files else make_object(name)
         made_by = provenance("objects", list(files), options) if files else provenance("objects", [])
-        write_object(out / name, g, name, made_by)  # the file does not depend on the other objects
+        write_object(out / name, g, name, made_by)  # a file does not depend on which other objects are written
         if sheet:
             images.append(object_portrait(g, 24.0 if files else ELEVATION.get(name, 24.0), name))
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())

@@ -1,4 +1,4 @@
-"""Procedural surface colours as functions of the point: 2D shapes composited in layers with soft edges."""
+"""Procedural surface colours as functions of position: 2D shapes composited in layers with soft edges."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EDGE_WIDTH = 0.005  # blur width of layer edges, about the spacing of the Gaussi
 
 
 def plain(colour: RGB) -> Callable[[Tensor], Tensor]:
-    """Constant colour."""
+    """A constant colour."""
     return lambda p: torch.tensor(colour).expand(len(p), 3)
 
 
@@ -35,7 +35,7 @@ def mix(a: RGB, b: RGB, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
 
 
 def fabric(p: Tensor, rgb: Tensor, seed: int, size: float = 0.012, depth: float = 0.1) -> Tensor:
-    """Colours with brightness noise of relative amplitude `depth` and features of `size`, as of fabric."""
+    """Colours with brightness noise of relative amplitude `depth` and features of `size`, like fabric."""
     return rgb * (1 + depth * (2 * noise(p, size, seed) - 1))[:, None]
 
 

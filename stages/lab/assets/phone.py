@@ -17,9 +17,9 @@ ICONS = (
     (0.3, 0.35, 0.4), (0.9, 0.25, 0.55), (0.25, 0.8, 0.85), (0.55, 0.8, 0.2),
     (0.95, 0.85, 0.3), (0.2, 0.3, 0.75), (0.85, 0.2, 0.2), (0.4, 0.85, 0.6),
 )  # fmt: skip
-ROWS = (0.2, 0.09, -0.02, -0.405)  # heights of the rows of icons, the last one in the dock
+ROWS = (0.2, 0.09, -0.02, -0.405)  # heights of the rows of icons; the last row is in the dock
 DUNES = ((-0.12, 0.05, (0.6, 0.2, 0.45)), (-0.2, -0.04, (0.4, 0.13, 0.4)), (-0.29, 0.03, (0.22, 0.08, 0.3)))
-CLOCK = (  # 12:34, each digit a line through corners of a cell 0.04 wide and 0.09 high
+CLOCK = (  # "12:34"; each digit is a polyline through corners of a cell 0.04 wide and 0.09 high
     (-0.155, ((1, 0), (1, 2))),
     (-0.06, ((0, 2), (1, 2), (1, 1), (0, 1), (0, 0), (1, 0))),
     (0.03, ((0, 2), (1, 2), (1, 1), (0.1, 1), (1, 1), (1, 0), (0, 0))),

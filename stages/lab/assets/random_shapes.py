@@ -1,7 +1,7 @@
-"""Random shapes and materials for training, so that models generalise beyond the ten objects.
+"""Random shapes and materials for training, to make models generalise beyond the ten objects.
 
-Shape families alternate; sizes, densities and stiffness are sampled log-uniformly over the range of the objects of
-GSCollision.
+Shape families are used in turn; sizes, densities and stiffness are sampled log-uniformly over the range of the objects
+of GSCollision.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from stages.lab.assets.signed_distance import (
     union,
 )
 
-FIRST_ID = 1000  # object id
+FIRST_ID = 1000  # first object id
 SIZE_RANGE = (0.3, 1.0)  # longest side [m]
 DENSITY_RANGE = (100.0, 2700.0)  # [kg/m^3]
-SPECIFIC_STIFFNESS_RANGE = (10.0, 7400.0)  # E over density [m^2/s^2]: from the rope to the phone, stable at the substep
-MAX_RADIUS = 0.55  # distance of the farthest point of a shape from its centre
+# E / density [m^2/s^2], from the rope to the phone; stable at the published substep
+SPECIFIC_STIFFNESS_RANGE = (10.0, 7400.0)
+MAX_RADIUS = 0.55  # largest distance of a point of a shape from its centre
 
 Generator = np.random.Generator
 
 
 def random_shapes(count: int, seed: int = 0) -> dict[str, ShapeKind]:
-    """`count` objects by name; the first ones do not depend on `count`."""
+    """`count` random objects by name; the first ones do not depend on `count`."""
     made = {}
     for i in range(count):
         rng = np.random.default_rng([seed, i])
@@ -58,7 +59,7 @@ def _log(rng: Generator, low: float, high: float) -> float:
 
 
 def _sides(rng: Generator, thinnest: float = 0.12) -> list[float]:
-    """Half sides of a random box whose corners are at MAX_RADIUS."""
+    """Half sides of a random box with its corners at distance MAX_RADIUS from the centre."""
     half = np.exp(rng.uniform(math.log(thinnest), 0, 3))
     return (MAX_RADIUS * half / np.linalg.norm(half)).tolist()
 
@@ -87,13 +88,13 @@ def _stick(rng: Generator) -> Field:
 
 
 def _vessel(rng: Generator) -> Field:
-    """A cup, bowl or vase: a wall and a bottom."""
+    """A cup, bowl or vase with a wall and a bottom."""
     height, (low, middle, high) = rng.uniform(0.12, 0.38), rng.uniform(0.15, 0.38, 3)
     return revolved_wall([(0, -height), (low, -height), (middle, 0), (high, height)], rng.uniform(0.03, 0.06))
 
 
 def _lump(rng: Generator) -> Field:
-    """A solid of revolution: a can, a cone, a pawn."""
+    """A solid of revolution, such as a can, a cone or a pawn."""
     height, (low, middle, high) = rng.uniform(0.15, 0.4), rng.uniform(0.06, 0.36, 3)
     return revolved([(0, -height), (low, -height), (middle, 0), (high, height), (0, height)], 0.02)
 

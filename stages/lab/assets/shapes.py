@@ -19,8 +19,8 @@ from stages.core.scene.gaussians import Gaussians
 def single_threaded() -> Iterator[None]:
     """Run PyTorch on one thread inside the context, so that results are bitwise reproducible.
 
-    The vector and scalar versions of sin or pow differ in the last bit, and the number of threads that process a tensor
-    decides which version computes an element.
+    The vectorised and scalar versions of sin or pow differ in the last bit, and the number of threads that process a
+    tensor determines which version computes an element.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -47,7 +47,7 @@ class Surface:
 
 
 def ellipsoid(radii: tuple[float, float, float], n: int) -> Surface:
-    """Fewer than `n` points on an ellipsoid: a stretched Fibonacci spiral, subsampled to even density."""
+    """Fewer than `n` points on an ellipsoid: a stretched Fibonacci spiral, subsampled to uniform density."""
     i = torch.arange(n) + 0.5
     z = 1 - 2 * i / n
     phi = i * torch.pi * (1 + 5**0.5)
@@ -55,13 +55,13 @@ def ellipsoid(radii: tuple[float, float, float], n: int) -> Surface:
     unit = torch.stack([flat * phi.cos(), flat * phi.sin(), z], 1)
     r = torch.tensor(radii)
     normals = torch.nn.functional.normalize(unit / r, dim=1)
-    area = (unit / r).norm(dim=1)  # surface per point after the stretch, up to a factor
+    area = (unit / r).norm(dim=1)  # area per point after stretching, up to a constant factor
     keep = torch.rand(n, generator=torch.Generator().manual_seed(n)) < area / area.max()
     return Surface(unit * r, normals).kept(keep)
 
 
 def superellipsoid(radii: tuple[float, float, float], power: float, n: int) -> Surface:
-    """Points on |x/a|^p + |y/b|^p + |z/c|^2 = 1, a cushion for p above 2."""
+    """Points on |x/a|^p + |y/b|^p + |z/c|^2 = 1, which is a cushion for p > 2."""
     rng = torch.Generator().manual_seed(n)
     r = torch.tensor(radii)
     xy = (torch.rand(n, 2, generator=rng) * 2 - 1) * r[:2]
@@ -91,14 +91,14 @@ def box(sides: tuple[float, float, float], spacing: float) -> Surface:
 
 
 def sheet(width: float, depth: float, spacing: float) -> Surface:
-    """Grid points on a horizontal rectangle at z = 0, normals up."""
+    """Grid points on a horizontal rectangle at z = 0, with normals up."""
     xs, ys = (torch.arange(0, side, spacing) - side / 2 for side in (width, depth))
     points = torch.nn.functional.pad(torch.cartesian_prod(xs, ys), (0, 1))
     return Surface(points, torch.tensor([[0.0, 0, 1]]).expand_as(points).clone())
 
 
 def union(*parts: Callable[[], tuple[Surface, Callable[[Tensor], Tensor]]]) -> Surface:
-    """Union of (surface, inside test) pairs: the points of each that are not inside another."""
+    """Union of (surface, inside test) pairs: the points of each surface that are not inside another."""
     pieces = []
     for i, (surface, _) in enumerate(parts):
         hidden = torch.zeros(len(surface.points), dtype=torch.bool)
@@ -109,7 +109,7 @@ def union(*parts: Callable[[], tuple[Surface, Callable[[Tensor], Tensor]]]) -> S
 
 
 def noise(points: Float[Tensor, "n 3"], size: float, seed: int) -> Float[Tensor, "n"]:
-    """Smooth value noise in 0..1 with features of the given size [m], deterministic by seed."""
+    """Smooth value noise in 0..1 with features of the given size [m]; deterministic for a seed."""
     lattice = torch.rand(64, 64, 64, generator=torch.Generator().manual_seed(seed))
     cell = (points / size).floor()
     f = points / size - cell
@@ -129,7 +129,7 @@ def to_gaussians(
 ) -> Gaussians:  # fmt: skip
     """Flat Gaussians that cover the surface: discs with a standard deviation of `width` times the local point spacing.
 
-    The spacing is limited to `widest` [m], for isolated points.
+    The spacing is limited to `widest` [m], which concerns isolated points.
     """
     from stages.core.geometry.neighbours import spacing
 

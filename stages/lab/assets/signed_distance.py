@@ -1,7 +1,7 @@
 """Signed distance fields: primitives, transformations and boolean operations.
 
-A field maps points (n, 3) to distances (n,), negative inside. Some are only approximate distances; the sampler divides
-by the gradient norm.
+A field maps points (n, 3) to distances (n,), negative inside. Some fields are only approximate distances; the sampler
+divides by the gradient norm.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 Field = Callable[[Tensor], Tensor]
 Vec = tuple[float, float, float]
-TUBE_FAR_DISTANCE = 0.15  # beyond the range of ambient occlusion
+TUBE_FAR_DISTANCE = 0.15  # value of tube fields far away, larger than the range of ambient occlusion
 
 
 def _floats(values: Sequence) -> Tensor:
@@ -44,7 +44,7 @@ def sphere(centre: Vec, radius: float) -> Field:
 
 
 def ellipsoid(centre: Vec, radii: Vec, R: Tensor | None = None) -> Field:
-    """An ellipsoid rotated by R about its centre; zero set exact, distance to first order."""
+    """An ellipsoid rotated by R about its centre; the zero set is exact, the distance accurate to first order."""
     c, r = _floats(centre), _floats(radii)
 
     def field(p: Tensor) -> Tensor:
@@ -56,7 +56,7 @@ def ellipsoid(centre: Vec, radii: Vec, R: Tensor | None = None) -> Field:
 
 
 def capsule(a: Vec, b: Vec, radius: float, end: float | None = None) -> Field:
-    """A capsule from a to b whose radius changes linearly from `radius` to `end`."""
+    """A capsule from a to b, whose radius changes linearly from `radius` to `end`."""
     start, axis = _floats(a), _floats(b) - _floats(a)
     grow = 0.0 if end is None else end - radius
 
@@ -83,7 +83,7 @@ def slab(centre: Vec, half: Vec, corner: float, edge: float) -> Field:
 
 
 def torus(centre: Vec, ring: float, tube: float) -> Field:
-    """A torus around the vertical with ring radius `ring` and tube radius `tube`."""
+    """A torus around the vertical axis with ring radius `ring` and tube radius `tube`."""
     c = _floats(centre)
 
     def field(p: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def tube(curve: Float[Tensor, "m 3"], radius: Float[Tensor, "m"] | float) -> Fie
     """A round tube along a finely sampled curve, with one radius or one per point; TUBE_FAR_DISTANCE far away."""
     radii = torch.as_tensor(radius).expand(len(curve))
     tree = cKDTree(curve.numpy())
-    max_distance = float(radii.max()) + TUBE_FAR_DISTANCE  # bounded search is several times faster
+    max_distance = float(radii.max()) + TUBE_FAR_DISTANCE  # a bounded search is several times faster
 
     def field(p: Tensor) -> Tensor:
         distance, index = tree.query(p.numpy(), distance_upper_bound=max_distance, workers=-1)
@@ -127,7 +127,7 @@ def posed(field: Field, R: Float[Tensor, "3 3"], offset: Vec = (0.0, 0.0, 0.0)) 
 
 
 def mirrored(field: Field) -> Field:
-    """The shape at positive x, and its mirror image."""
+    """The part of a shape at positive x, and its mirror image."""
     flip = torch.tensor([1.0, 0, 0])
     return lambda p: field(p + flip * (p[:, :1].abs() - p[:, :1]))
 

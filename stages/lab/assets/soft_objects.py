@@ -21,7 +21,7 @@ SHIRT = [(-0.28, -0.45), (0.28, -0.45), (0.275, -0.2), (0.27, 0.14), (0.43, 0.03
 
 
 def folds(q: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Height of the cloth: raised in the middle, long soft folds from the armpits, small ones at the sleeves."""
+    """Height of the cloth: raised in the middle, long soft folds from the armpits, and small ones on the sleeves."""
     x, y = q.unbind(1)
     flat = torch.nn.functional.pad(q, (0, 1))
     drift = noise(flat, 0.35, 7)
@@ -62,7 +62,7 @@ def cloth() -> Gaussians:
 
 
 def rounded(corners: list) -> list[tuple[float, float]]:
-    """The polygon with rounded corners, by two rounds of corner cutting (Chaikin 1974, with narrower cuts)."""
+    """The polygon with its corners rounded by two iterations of corner cutting (Chaikin 1974, with narrower cuts)."""
     points = torch.tensor(corners)
     for _ in range(2):
         nxt = points.roll(-1, 0)
@@ -160,7 +160,7 @@ def rope() -> Gaussians:
         return layers.mix((0.4, 0.07, 0.06), (0.72, 0.16, 0.12), wound)
 
     whipping = tube(torch.cat([line[34:71], line[-71:-34]]), 0.0775)
-    fillet = tube(line, 0.03)  # between the strands
+    fillet = tube(line, 0.03)  # fills the space between the strands
     return gaussians_from_parts(
         [PaintedPart(union(tube(strands, 0.041), fillet), paint), PaintedPart(whipping, cord)],
         (0.64, 0.5, 0.28),

@@ -22,17 +22,17 @@ from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.objects import POINT_CLOUD
 from stages.render.overlay import draw_caption
 
-VIEWS, RESOLUTION = 100, 1280  # of cameras.json
+VIEWS, RESOLUTION = 100, 1280  # number of cameras in cameras.json, and their image side [px]
 SHEET_BACKGROUND = torch.tensor([0.955, 0.95, 0.94])  # background colour of portraits
 
 
 def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> None:
-    """Write FOLDER/point_cloud/iteration_30000/point_cloud.ply, and an orbit around it as FOLDER/cameras.json."""
+    """Write FOLDER/point_cloud/iteration_30000/point_cloud.ply, and a camera orbit as FOLDER/cameras.json."""
     ply = folder / POINT_CLOUD
     ply.parent.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "cameras.json") as part:
         part.write_text(json.dumps(camera_rows(orbit(VIEWS, torch.zeros(3), 2.4, 20.0), RESOLUTION)))
-    # last, since what has this file is complete
+    # written last: a folder with this file is complete
     write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
 
 
@@ -50,7 +50,7 @@ def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
 
 
 def object_portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
-    """Image of an object, fitted to the frame, on white ground with a shadow; `elevation` of the camera in [deg]."""
+    """Image of an object, fitted to the frame, on white ground with a shadow; camera `elevation` in [deg]."""
     side = float((g.means.amax(0) - g.means.amin(0)).max())
     g = replace(g, means=g.means / side, scales=g.scales / side)
     eye = 2.2 * _direction(elevation)
@@ -64,7 +64,7 @@ def background_portrait(g: Gaussians, label: str) -> Float[Tensor, "h w 3"]:
 
 
 def _direction(elevation: float, azimuth: float = -75.0) -> Float[Tensor, "3"]:
-    """Unit vector at these angles [deg]."""
+    """Unit vector with these angles [deg]."""
     el, az = torch.deg2rad(torch.tensor([elevation, azimuth])).unbind()
     return torch.stack([el.cos() * az.cos(), el.cos() * az.sin(), el.sin()])
 

@@ -22,19 +22,20 @@ from stages.lab.assets.backgrounds import BACKGROUNDS, TABLE_HEIGHT, make_backgr
 from stages.lab.assets.objects import OBJECTS, make_object
 
 ARRANGEMENTS = ("apart", "touching")
-OBJECTS_PER_SCENE = 5  # so that two scenes show all ten objects
-MAX_RADIUS = 1.5  # of the objects from the centre of the table [m]
-MIN_GAP = 0.12  # between separate objects [m]
-CONTACT_GAP = 0.015  # between the nearest Gaussians of touching objects [m], about their spacing
-DISTANCE_SAMPLES = 4000  # Gaussians per object between which distances are computed
+OBJECTS_PER_SCENE = 5  # two scenes together show all ten objects
+MAX_RADIUS = 1.5  # largest distance of an object's points from the centre of the table [m]
+MIN_GAP = 0.12  # smallest distance between separate objects [m]
+CONTACT_GAP = 0.015  # distance between the nearest Gaussians of touching objects [m], about their spacing
+DISTANCE_SAMPLES = 4000  # number of Gaussians per object used to compute distances
 WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the cameras [px]
-CAMERA_DISTANCE = 3.8  # from the scene, as in the data set [m]
+CAMERA_DISTANCE = 3.8  # distance of the cameras from the scene, as in the data set [m]
 
 
 def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
     """Scene `index` of an arrangement: five objects resting on a table, with true object ids, and `photos` cameras.
 
-    Two consecutive scenes show all ten objects. In "touching" scenes the first three objects touch, and the last two.
+    Two consecutive scenes show all ten objects. In "touching" scenes the first three objects touch each other, and so
+    do the last two.
     """
     rng = np.random.default_rng([ARRANGEMENTS.index(kind), index // 2])
     names = list(rng.permutation(list(OBJECTS)))[OBJECTS_PER_SCENE * (index % 2) :][:OBJECTS_PER_SCENE]
@@ -81,7 +82,7 @@ def _points(g: Gaussians) -> np.ndarray:
 
 
 def _push_together(rng: np.random.Generator, objects: list[Gaussians]) -> list[Gaussians]:
-    """Each object moved along the table from a random side until it touches those before it."""
+    """Move each object along the table from a random direction until it touches the previous ones."""
     out = objects[:1]
     for moving in objects[1:]:
         tree, points = cKDTree(np.concatenate([_points(g) for g in out])), _points(moving)
@@ -89,7 +90,7 @@ def _push_together(rng: np.random.Generator, objects: list[Gaussians]) -> list[G
         direction = np.array([math.cos(angle), math.sin(angle), 0.0])
         far = 3.0
         while (gap := tree.query(points + far * direction)[0].min()) > CONTACT_GAP:
-            far -= max(gap - CONTACT_GAP, 0.002)  # never overlapping: gaps shrink no faster than the object moves
+            far -= max(gap - CONTACT_GAP, 0.002)  # never overlaps: the gap shrinks no faster than the object moves
             if far < -3.0:
                 raise ValueError("two objects miss each other")
         out = [*out, _moved(moving, torch.tensor(far * direction).float())]
@@ -97,7 +98,7 @@ def _push_together(rng: np.random.Generator, objects: list[Gaussians]) -> list[G
 
 
 def _place_apart(rng: np.random.Generator, objects: list[Gaussians], others: list[Gaussians]) -> list[Gaussians]:
-    """The objects, translated together to a free position on the table, MIN_GAP or more from the others."""
+    """Translate the objects together to a free position on the table, at least MIN_GAP from the others."""
     points = np.concatenate([_points(g)[:, :2] for g in objects])
     centre = points.mean(0)
     tree = cKDTree(np.concatenate([_points(g)[:, :2] for g in others])) if others else None

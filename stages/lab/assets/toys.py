@@ -26,18 +26,18 @@ def falling_toys() -> Scene:
 
 
 def mix(a: tuple, b: tuple, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Linear blend of the colours a (where t is 0) and b (where it is 1)."""
+    """Linear interpolation between the colours a (t = 0) and b (t = 1)."""
     return torch.tensor(a) + (torch.tensor(b) - torch.tensor(a)) * t[:, None]
 
 
 def speckled(points: Tensor, rgb: Tensor, seed: int, size: float = 0.006, depth: float = 0.45) -> Tensor:
-    """Colours with brightness noise at two sizes, so that image features can be detected."""
+    """Colours with brightness noise at two scales, so that image features can be detected."""
     grain = 0.6 * noise(points, size, seed) + 0.4 * noise(points, 3.1 * size, seed + 1)
     return rgb * (1 + depth * (2 * grain[:, None] - 1))
 
 
 def _table() -> Gaussians:
-    """Planks with grain and dark stains."""
+    """A table of planks with grain and dark stains."""
     s = sheet(1.5, 1.3, 0.0055)
     p = s.points
     plank = (p[:, 1] / 0.13).floor()
@@ -53,7 +53,7 @@ def _table() -> Gaussians:
 
 
 def _ball(centre: tuple) -> Gaussians:
-    """Six coloured sectors between white poles."""
+    """A ball with six coloured sectors between white poles."""
     s = ellipsoid((0.07, 0.07, 0.07), 9000)
     p = s.points
     sector = ((torch.atan2(p[:, 1], p[:, 0]) / torch.pi + 1) * 3).floor().long().remainder(6)
@@ -99,7 +99,7 @@ def _duck(centre: tuple) -> Gaussians:
 
 
 def _part(radii: tuple, centre: tuple, n: int):
-    """An ellipsoid of n points, and its inside test."""
+    """An ellipsoid sampled by up to n points, and its inside test."""
     c, r = torch.tensor(centre), torch.tensor(radii)
     return ellipsoid(radii, n).moved(centre), lambda p: ((p - c) / r).norm(dim=1) < 0.985
 

@@ -1,4 +1,4 @@
-"""Orientation of the faces of meshes with inverted faces."""
+"""Consistent orientation of the faces of meshes that have inverted faces."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-MERGE_DISTANCE = 1e-6  # vertices this close are one [longest sides]
-MAX_OPEN_EDGES = 0.02  # fraction of open edges up to which a surface counts as closed
+MERGE_DISTANCE = 1e-6  # vertices closer than this are merged [longest sides]
+MAX_OPEN_EDGES = 0.02  # largest fraction of open edges of a surface that counts as closed
 
 
 def winding_signs(corners: np.ndarray) -> np.ndarray:
-    """+1 for each triangle to keep and -1 for each to reverse, so that normals point outwards.
+    """+1 for each triangle to keep and -1 for each to reverse, such that normals point outwards.
 
-    `corners` (f, 3, 3), about 1 in size. Neighbouring faces of a connected surface get the same orientation: outwards
-    if the surface is closed (positive volume), else that of the larger part of its area. Surfaces without two sides
-    are kept.
+    `corners` (f, 3, 3) should be about 1 in size. Neighbouring faces of a connected surface get consistent
+    orientations: outwards if the surface is closed (positive volume), otherwise that of the larger part of its area.
+    Non-orientable surfaces are kept.
     """
     f = len(corners)
     _, vertex = np.unique(np.round(corners.reshape(-1, 3) / MERGE_DISTANCE), axis=0, return_inverse=True)
@@ -26,7 +26,7 @@ def winding_signs(corners: np.ndarray) -> np.ndarray:
     order = np.argsort(edge, kind="stable")
     first, second = order[faces[edge[order]] == 2].reshape(-1, 2).T
     a, b = first // 3, second // 3
-    # node i: face i as given, node f + i: reversed; consistent neighbours run along their edge in opposite directions
+    # node i: face i as given, node f + i: face i reversed; consistent neighbours traverse their edge oppositely
     consistent = edges[first, 0] != edges[second, 0]
     rows, columns = np.append(a, a + f), np.append(np.where(consistent, b, b + f), np.where(consistent, b + f, b))
     graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(2 * f, 2 * f))

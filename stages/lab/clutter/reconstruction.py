@@ -26,7 +26,7 @@ from stages.reconstruct.step_cache import StepCache
 MAX_DISTANCE = 0.025  # largest distance from the true surface; Gaussians beyond are floaters [camera distances]
 FLOATER = -1  # label of floaters
 POINTS = (600, 2500)  # number of points of the sparse model, as structure from motion finds in a dozen photos
-POINT_NOISE = 0.002  # standard deviation of their positions [camera distances]
+POINT_NOISE = 0.002  # standard deviation of the sparse points' positions [camera distances]
 HIDDEN = 0.02  # depth difference to the visible surface from which a point is not seen [camera distances]
 ITERATIONS = 600  # of the photometric fit; positions hardly change later
 

@@ -26,7 +26,7 @@ from stages.lab.track.synthesis import Synthesiser
 
 BEHIND = 0.1  # largest depth of a visible Gaussian behind the rendered surface [object sizes]
 LATEST = 9  # number of latest frames over which the median is taken
-ENOUGH = 3  # smallest number of these frames in which a Gaussian must be seen
+ENOUGH = 3  # smallest number of the LATEST frames in which a Gaussian must be seen to learn its colour
 
 
 class Sightings(NamedTuple):

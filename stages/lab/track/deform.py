@@ -29,8 +29,8 @@ from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Synthesiser
 
 NODES, FOLLOWED, NEIGHBOURS = 40, 4, 6  # nodes of an object, nodes that a point follows, neighbours of a node
-STRETCH = 0.05  # edge deformation that weighs as much as one pixel with an error of PIXEL_NOISE [edge lengths]
-SPEED = 0.1  # node displacement since the last frame that weighs as much as one such pixel [object sizes]
+STRETCH = 0.05  # edge deformation that weighs like a pixel with error PIXEL_NOISE [edge lengths]
+SPEED = 0.1  # node displacement since the last frame that weighs like a pixel with error PIXEL_NOISE [object sizes]
 STEPS = {4: 3, 2: 2}  # number of Gauss-Newton steps by image reduction, coarse to fine
 
 

@@ -24,16 +24,16 @@ from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 
 log = logging.getLogger(__name__)
 FIRST = {8: 4, 4: 4}  # maximum number of Gauss-Newton steps by image reduction, in the first pass
-REFINING = {4: 2, 2: 2}  # the same in later passes, where both neighbouring frames are known
+REFINING = {4: 2, 2: 2}  # maximum number of steps by image reduction, in later passes, with both neighbours known
 JUDGING = 2  # image reduction at which confidences are computed
 RETIMING = (4, 2)  # image reduction at which film starts are corrected, before each later pass
 RETIMING_STEPS = 2  # Gauss-Newton steps of each correction of the film starts
 CERTAIN = 0.85  # confidence, relative to the object's usual one, from which a lost object counts as found
-FOUND = 0.75  # the same for an object found by a search with an unambiguous pose
+FOUND = 0.75  # confidence relative to the usual one from which an object found by a search with a distinct pose counts
 LASTING = 3  # number of frames for which an object found again must stay visible
 WRONG_TURNS, WRONG_VIEWS = 8, 3  # number of wrong rotations and of images from which tolerances are computed
 FALLING = 6  # number of frames of free fall to which the release time is fitted
-MAX_MISFIT = 0.1  # largest deviation from free fall in these frames [frames]
+MAX_MISFIT = 0.1  # largest deviation from free fall in the fit of the release time [frames]
 
 
 @dataclass(frozen=True)

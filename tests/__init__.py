@@ -1,8 +1,8 @@
 """While tests run, `jaxtyping` checks the shapes in annotations, if `beartype` is installed.
 
-Of the calls of a function in one test the first are checked and then every so many: checks of all of them would take a
-third of the time of a simulation. Functions within functions count as one, however often they are made; data classes
-are checked where they are constructed.
+In each test the first FIRST calls of a function are checked, and then every EVERY-th one: checking all calls would take
+a third of the time of a simulation. All instances of a nested function count as one function; data classes are checked
+when they are constructed.
 """
 
 import dataclasses
@@ -16,15 +16,15 @@ from typing import Any, get_type_hints
 
 import jaxtyping
 
-FIRST, EVERY = 3, 20  # calls
-calls: Counter[int] = Counter()  # in this test, by the address of the code, whose own hash is slow
-made: Counter[int] = Counter()  # functions within functions, in this test
+FIRST, EVERY = 3, 20  # number of calls checked at the start, and interval of later checks
+calls: Counter[int] = Counter()  # per test, by the address of the code object, whose own hash is slow
+made: Counter[int] = Counter()  # number of times that each nested function was created in this test
 check_all = jaxtyping.jaxtyped
-new_lengths = check_all("context")  # within it, letters in shapes have no lengths yet
+new_lengths = check_all("context")  # context manager: shape letters inside it are not yet bound to lengths
 
 
 def hints_of(function: FunctionType) -> dict[str, Any]:
-    """The annotations of a function; Any for those with names that are not known where it is."""
+    """The annotations of a function; Any for those with names that cannot be resolved in its module."""
 
     def holder():
         pass
@@ -46,9 +46,10 @@ def hints_of(function: FunctionType) -> dict[str, Any]:
 
 
 def checked_calls(function: FunctionType, typechecker: Callable) -> Callable:
-    """Checks arguments and result of every call, as what `jaxtyping.jaxtyped` returns, but takes far less time.
+    """A wrapper that checks arguments and result of every call, like `jaxtyping.jaxtyped` but much faster.
 
-    That compiles two functions for each, to check the arguments before the call and once more with the result.
+    `jaxtyped` compiles two functions for each function, to check the arguments before the call and again with the
+    result.
     """
     if inspect.isgeneratorfunction(function):
         return check_all(function, typechecker=typechecker)
@@ -69,11 +70,11 @@ def checked_calls(function: FunctionType, typechecker: Callable) -> Callable:
 
 
 def check_some(*, typechecker: Callable) -> Callable:
-    """Instead of `jaxtyping.jaxtyped`, which decorates the functions and classes of the modules that are checked."""
+    """Replacement for `jaxtyping.jaxtyped`, which decorates functions and classes of the checked modules."""
 
     def decorate(function):
         if function.__module__ == "stages.core.scene.error_deferring_file":
-            return function  # HDF5 calls it, and loses an interrupt within a wrapper
+            return function  # called by HDF5, which would lose an interrupt inside a wrapper
         if isinstance(function, type):
             if dataclasses.is_dataclass(function) and "__init__" in vars(function):
                 function.__init__ = decorate(function.__init__)
@@ -83,7 +84,7 @@ def check_some(*, typechecker: Callable) -> Callable:
             count = made[code] = made[code] + 1
             if count > FIRST and count % EVERY:
                 return function
-        checked = None  # until the first call: most functions are never called
+        checked = None  # created on the first call, since most functions are never called
 
         @wraps(function)
         def call(*args, **options):

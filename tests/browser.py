@@ -1,4 +1,4 @@
-"""A real browser, drawn by software: Debian's chromium, started once and given a new page for each test."""
+"""Fixtures for a real browser with software rendering: Debian's chromium, started once, with a new page per test."""
 
 import os
 import shutil
@@ -11,12 +11,12 @@ FLAGS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
-LONGEST = 120.0  # for which a busy machine is waited for [s]
+LONGEST = 120.0  # longest wait for a busy machine [s]
 SIZE = {"width": 480, "height": 360}  # of the window [px]
 
 
 def until(page, condition: str, seconds: float = LONGEST) -> None:
-    """Wait until a JavaScript expression is true; the page's policy forbids playwright's own way, which needs eval."""
+    """Wait until a JavaScript expression is true. Playwright's own way needs eval, which the page's policy forbids."""
     end = time.monotonic() + seconds
     while not page.evaluate(condition):
         assert time.monotonic() < end, f"{condition} did not become true"
@@ -34,7 +34,7 @@ def drag_up(page, spot: tuple[float, float], steps: int, rise: float) -> None:
 
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory):
-    """The running browser; the tests that need it are skipped where it is not installed."""
+    """The running browser; tests that need it are skipped if it is not installed."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("no chromium on this machine (apt-get install chromium)")
@@ -52,9 +52,9 @@ def chromium(tmp_path_factory):
 
 @pytest.fixture
 def open_page(chromium):
-    """A function that opens a page, a file or an address, and returns it once it is `loaded`.
+    """A function that opens a page, which is a file or an address, and returns it once it is `loaded`.
 
-    The test fails on errors of the page, and where it fetches anything else than its address and what is `beside` it.
+    The test fails on errors of the page, and if the page fetches anything but its address and the files `beside` it.
     """
     errors, pages = [], []
 

@@ -1,4 +1,4 @@
-"""A local server with OpenAI's protocol that answers as a test tells it to, well or badly."""
+"""A local server with OpenAI's protocol that replies, correctly or not, as a test prescribes."""
 
 import json
 import threading
@@ -15,8 +15,8 @@ KEY = "not-a-real-key"
 class Server(ThreadingHTTPServer):
     """Replies with the entries of `script`, one per request.
 
-    An entry is the text of a reply; a status, or (status, headers); bytes as the body; a function that gets the
-    handler and writes what it likes; or "close", which ends the connection without a word.
+    An entry is the text of a reply; a status, or (status, headers); bytes as the body; a function that receives the
+    handler and writes whatever it likes; or "close", which closes the connection without a reply.
     """
 
     daemon_threads = True
@@ -27,7 +27,7 @@ class Server(ThreadingHTTPServer):
         self.url = f"http://127.0.0.1:{self.server_address[1]}/v1"
 
     def wait_for(self, requests: int) -> None:
-        """Until so many have been read, at most 2 min: a client may give up before a busy machine reads its request."""
+        """Wait until this number of requests has been read, at most 2 min, since clients may give up before that."""
         for _ in range(12_000):
             if len(self.asked) >= requests:
                 break

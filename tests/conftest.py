@@ -1,4 +1,4 @@
-"""Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
+"""Fixtures for tiny scenes, devices and external programs, and skips for data and packages that may be missing."""
 
 import gc
 import logging
@@ -23,27 +23,27 @@ from tests.browser import chromium, open_page  # noqa: F401 -- fixtures
 from tests.chat_server import chat_server  # noqa: F401 -- a fixture
 from tests.firefox import open_firefox  # noqa: F401 -- fixture
 
-if "OMP_NUM_THREADS" not in os.environ:  # plugins import PyTorch before this file, so the variable would be too late
+if "OMP_NUM_THREADS" not in os.environ:  # plugins import PyTorch earlier, so it is too late to set the variable
     torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
-gc.disable()  # until the tests are collected: the millions of objects of imported modules and tests stay for good
+gc.disable()  # until tests are collected, since the millions of objects of imported modules and tests are never freed
 
 
 def pytest_collection_finish() -> None:
-    """From here on garbage is collected again, seldom and without a look at what is there already."""
+    """Enable garbage collection again, with a high threshold and without scanning the objects that exist already."""
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
     gc.enable()
-    # in each test pytest gives its handlers to all loggers that do not propagate, of which PyTorch has seventy
+    # pytest adds its handlers in each test to all loggers that do not propagate; PyTorch has seventy of them
     for name, logger in logging.root.manager.loggerDict.items():
         if name.startswith("torch") and isinstance(logger, logging.Logger):
             logger.propagate = True
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """What is parametrised with a GPU is selected by `-m gpu`, and what needs one is skipped without."""
+    """Select tests parametrised with a GPU by `-m gpu`, and skip tests that need a GPU if there is none."""
     for item in items:
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
@@ -53,7 +53,7 @@ def pytest_collection_modifyitems(items) -> None:
 
 @contextmanager
 def skipped_without_package() -> Iterator[None]:
-    """Skip the test, with the name of the package, where an error follows from a package that is not installed."""
+    """Skip the test, naming the package, if an error is caused by a package that is not installed."""
     try:
         yield
     except Exception as error:
@@ -66,7 +66,7 @@ def skipped_without_package() -> Iterator[None]:
 
 
 class CliRunner(testing.CliRunner):
-    """Runs commands; raises MissingPackage where that is why one failed, so that the test is skipped."""
+    """Runs commands; raises MissingPackage if a command failed because of a missing package, to skip the test."""
 
     def invoke(self, *args, **options):
         done = super().invoke(*args, **options)
@@ -91,7 +91,7 @@ def pytest_runtest_call():
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """PyTorch on one thread: faster for tiny tensors."""
+    """Run PyTorch on one thread, which is faster for tiny tensors."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -100,7 +100,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def with_threads() -> Iterator[Callable]:
-    """Calls a function with a number of threads of PyTorch."""
+    """A function that calls another function with a given number of PyTorch threads."""
     before = torch.get_num_threads()
 
     def call(threads, function, *arguments):
@@ -113,16 +113,16 @@ def with_threads() -> Iterator[Callable]:
 
 @pytest.fixture(scope="module", params=DEVICES)
 def device(request) -> str:
-    """The device of a test: also what `--device auto`, the default of every command, picks while the test runs.
+    """The device of a test, which `--device auto`, the default of every command, selects while the test runs.
 
-    Fixtures of a whole module run before that is arranged, and name the device to the commands that they call.
+    Module-scoped fixtures run before this takes effect, and must pass the device to the commands that they call.
     """
     return request.param
 
 
 @pytest.fixture(autouse=True)
 def auto_picks_the_device_of_the_test(request) -> Iterator[None]:
-    """No GPU is available to tests on the CPU."""
+    """Hide GPUs from tests on the CPU."""
     with pytest.MonkeyPatch.context() as patch:
         if "device" in request.fixturenames and request.getfixturevalue("device") == "cpu":
             patch.setattr(torch.cuda, "is_available", lambda: False)
@@ -131,14 +131,14 @@ def auto_picks_the_device_of_the_test(request) -> Iterator[None]:
 
 @pytest.fixture
 def shared() -> Path:
-    """Real photos and splats that are not ours to ship."""
+    """The folder with real photos and splats, which are not part of the repository."""
     if not (SHARED / "data").is_dir():
         pytest.skip("the shared data are not on this machine")
     return SHARED
 
 
 def random_gaussians(n: int, seed: int = 0, degree: int = 0, size: float = 0.05) -> Gaussians:
-    """Gaussians in the unit cube around the origin."""
+    """Random Gaussians in the unit cube around the origin."""
     rng = torch.Generator().manual_seed(seed)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
     return Gaussians(
@@ -152,12 +152,12 @@ def random_gaussians(n: int, seed: int = 0, degree: int = 0, size: float = 0.05)
 
 
 def deform(gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: torch.Tensor) -> Gaussians:
-    """The Gaussians of one frame."""
+    """The Gaussians deformed to one frame."""
     return Skinning(gaussians, binding, keypoints)(positions)
 
 
 def ring(count: int = 6, size: int = 64, target: float = 0.0) -> Cameras:
-    """Cameras around the vertical through the origin, two units away."""
+    """A ring of cameras around the vertical axis through the origin, two units away."""
     viewmats = orbit(count, torch.tensor([0.0, 0, target]), radius=2.0, elevation=25.0)
     K = intrinsics(size, size, 1.5 * size)
     sizes = torch.full((count, 2), size)

@@ -1,4 +1,4 @@
-"""Distinct cells are those of `unique(dim=0)`."""
+"""Distinct cells, compared with `unique(dim=0)`."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from stages.core.geometry.cells import distinct_cells
 
 
-@pytest.mark.parametrize("reach", [1, 5, 2**40])  # with the last one a row does not fit into a number
+@pytest.mark.parametrize("reach", [1, 5, 2**40])  # with the last reach, a row cannot be packed into one integer
 @pytest.mark.parametrize("dimensions", [1, 2, 3])
 def test_as_unique_rows(reach, dimensions, device):
     cells = torch.randint(-reach, reach + 1, (400, dimensions), generator=torch.Generator().manual_seed(0)).to(device)

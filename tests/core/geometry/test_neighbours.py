@@ -16,7 +16,7 @@ def cloud():
 
 @pytest.mark.parametrize("k", [1, 32])
 def test_brute_force_equals_the_tree(cloud, k, monkeypatch):
-    monkeypatch.setattr(BruteForce, "MAX_ENTRIES", 100_000)  # several chunks
+    monkeypatch.setattr(BruteForce, "MAX_ENTRIES", 100_000)  # forces several chunks
     points, queries = cloud
     (distance, found), (expected, index) = (search(points).query(queries, k) for search in (BruteForce, KDTree))
     torch.testing.assert_close(distance, expected, rtol=0, atol=1e-5)
@@ -76,7 +76,7 @@ def test_spacing_of_a_line():
 
 def test_spacing_is_the_root_mean_square_of_three_distances():
     line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [4, 0, 0], [100, 0, 0]])
-    torch.testing.assert_close(spacing(line)[0], torch.tensor(7.0).sqrt())  # 1, 2 and 4 away
+    torch.testing.assert_close(spacing(line)[0], torch.tensor(7.0).sqrt())  # the neighbours are at distances 1, 2 and 4
 
 
 def test_a_tree_of_no_points_is_refused():

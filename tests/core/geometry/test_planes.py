@@ -1,4 +1,4 @@
-"""Planes through noisy points with outliers."""
+"""Plane fits to noisy points with outliers."""
 
 import math
 
@@ -9,7 +9,7 @@ from stages.core.geometry.planes import Plane, fit_plane, planes_through, ransac
 
 
 def angle(a, b) -> float:
-    """Degrees between two directions, signs ignored."""
+    """Angle between two directions, ignoring their signs [deg]."""
     return math.degrees(math.acos(min(1.0, abs(float(a @ b)))))
 
 
@@ -54,7 +54,7 @@ def test_ransac_with_half_outliers():
     assert angle(plane.normal, normal) < 0.3
     assert plane.normal[2] > 0 and abs(plane.offset + 0.2) < 0.003
     assert inside[:1000].float().mean() > 0.99
-    assert inside[1000:].float().mean() < 0.05  # a slab of 0.04 crosses a cube of side 4
+    assert inside[1000:].float().mean() < 0.05  # a slab of thickness 0.04 through a cube of side 4
 
 
 def test_larger_plane_with_forbidden_normal_is_rejected():

@@ -28,7 +28,8 @@ def test_a_rigid_motion_has_no_scale():
     found = umeyama(points, TRANSFORM(points), scaled=False)
     assert found.scale == 1
     torch.testing.assert_close(found.rotation, ROTATION)
-    torch.testing.assert_close(found(points).mean(0), TRANSFORM(points).mean(0))  # least squares: centre onto centre
+    # least squares: centroid onto centroid
+    torch.testing.assert_close(found(points).mean(0), TRANSFORM(points).mean(0))
 
 
 def test_points_in_one_place_are_moved_there():

@@ -1,4 +1,4 @@
-"""Faces that meet at points of a surface."""
+"""Detection of the faces that meet at points of a surface."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SIDES = np.array([1.0, 0.8, 0.6])
 
 
 def box_points(spacing: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a box around the origin, of a lattice, and normals: at edges and corners between the faces'."""
+    """Lattice points (n, 3) on a box around the origin, with normals averaged over the faces at edges and corners."""
     axes = [np.linspace(-0.5, 0.5, round(s / spacing) + 1) * s for s in SIDES]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     outward = np.where(np.isclose(np.abs(x), SIDES / 2), np.sign(x), 0.0)
@@ -22,18 +22,18 @@ def test_faces_of_a_box_at_its_faces_edges_and_corners():
     flatness, faces = surface_faces(points, normals)
     meeting = np.isclose(np.abs(points), SIDES / 2)  # which of the three faces each point is on
     count = meeting.sum(1)
-    inner = (np.abs(points) < SIDES / 2 - 0.11).sum(1) == 2  # away from the edges
+    inner = (np.abs(points) < SIDES / 2 - 0.11).sum(1) == 2  # points in the interior of a face
     assert inner.sum() > 500 and (flatness[inner] == pytest.approx(1)) and not flatness[count > 1].any()
     assert np.array_equal(faces[inner, 0], normals[inner]) and not faces[inner, 1:].any()
-    clear = ((np.abs(points) < SIDES / 2 - 0.16) | meeting).all(1)  # of other edges and corners
+    clear = ((np.abs(points) < SIDES / 2 - 0.16) | meeting).all(1)  # points away from all other edges and corners
     for k in (2, 3):
         mine = clear & (count == k)
         found = faces[mine]
         assert mine.sum() == {2: 4 * (13 + 9 + 5), 3: 8}[k]
         assert ((np.linalg.norm(found, axis=2) > 0).sum(1) == k).all()
         there = np.where(meeting, np.sign(points), 0.0)[mine]
-        assert np.abs(found).max(1) == pytest.approx(np.abs(there))  # each axis once, with
-        assert found.sum(1) == pytest.approx(there)  # its sign
+        assert np.abs(found).max(1) == pytest.approx(np.abs(there))  # each axis occurs once
+        assert found.sum(1) == pytest.approx(there)  # with the right sign
 
 
 def test_points_of_a_sheet_are_on_the_face_of_their_side():
@@ -47,7 +47,7 @@ def test_points_of_a_sheet_are_on_the_face_of_their_side():
 
 
 def test_the_end_of_a_thin_rod_is_a_face():
-    """Of three points along a side, of which only the middle one is on a face by those around it."""
+    """Only the middle one of the three points along a side is recognised as on a face from its neighbours."""
     x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
     end = np.column_stack([x.ravel(), y.ravel(), np.zeros(9)])
     k, z = np.meshgrid([-1.0, 0.0, 1.0], np.arange(0.5, 12))
@@ -62,7 +62,7 @@ def test_the_end_of_a_thin_rod_is_a_face():
 
 
 def test_a_point_known_to_be_at_an_edge_far_from_every_face_has_none():
-    """The tip of a long thin cone: its own normal, along the axis, is that of no face."""
+    """At the tip of a long thin cone: the point's own normal, along the axis, belongs to no face."""
     tip, far = np.zeros((30, 3)), 10 + np.random.default_rng(0).normal(size=(30, 3))
     points, normals = np.concatenate([tip, far]), np.tile([0.0, 0, 1], (60, 1))
     at_edge = np.arange(60) < 30

@@ -1,4 +1,4 @@
-"""Eigenvectors of many small symmetric matrices, and solutions of systems of equations."""
+"""Eigenvectors of batches of small symmetric matrices, and solutions of systems of equations."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from stages.core.geometry.symmetric_matrices import BATCH, PAIRS, eigh, least_di
 
 
 def test_more_matrices_than_the_solver_takes_at_once(device):
-    count = 2_000_003 if device == "cuda" else BATCH + 3  # on a GPU as many as a large scene has voxels
+    count = 2_000_003 if device == "cuda" else BATCH + 3  # on a GPU, as many as the voxels of a large scene
     A = torch.rand(count, 3, 3, generator=torch.Generator().manual_seed(0)).to(device) - 0.5
     A = A + A.mT
     values, vectors = eigh(A)
@@ -22,7 +22,7 @@ def test_more_matrices_than_the_solver_takes_at_once(device):
 
 @pytest.mark.gpu
 def test_first_calls_of_threads():
-    """In a new process: PyTorch loads the solver with the first call."""
+    """In a new process, because PyTorch loads the solver on the first call."""
     subprocess.run([sys.executable, "-c", """
 import threading, torch
 from stages.core.geometry.symmetric_matrices import eigh
@@ -42,7 +42,7 @@ assert len(done) == 8
     (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1e-24, 1e-20, 1e-20), (1 - 2e-9, 1 - 1e-9, 1.0),
 ])  # fmt: skip
 def test_least_directions_are_those_of_lapack(eigenvalues):
-    """By the quotient of Rayleigh where the two least eigenvalues are equal, so that any direction between is right."""
+    """Compared by the Rayleigh quotient: for two equal smallest eigenvalues any direction between them is valid."""
     rng = np.random.default_rng(0)
     turn = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
     A = np.einsum("nij,j,nkj->nik", turn, eigenvalues, turn)

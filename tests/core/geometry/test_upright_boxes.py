@@ -1,4 +1,4 @@
-"""Longest sides of upright boxes around objects, turned about the vertical."""
+"""Longest sides of upright bounding boxes, which may be rotated about the vertical."""
 
 import math
 
@@ -13,7 +13,7 @@ from stages.lab.assets.shapes import ellipsoid
 
 @pytest.mark.parametrize("sides", [(0.3, 0.2, 0.1), (0.2, 0.2, 0.1), (0.1, 0.2, 0.4)])
 def test_of_a_box_turned_about_the_vertical(sides):
-    """Of one with the sides .3, .2 and .1 the box along the axes would have up to .36."""
+    """The axis-aligned bounding box of a box with sides .3, .2 and .1 would have sides up to .36."""
     points = torch.cartesian_prod(*(torch.tensor([0.0, side], dtype=torch.float64) for side in sides))
     lengths = [longest_side(points @ turned(angle)) for angle in np.linspace(0, 7, 20)]
     np.testing.assert_allclose(lengths, max(sides), rtol=1e-9)
@@ -24,7 +24,7 @@ def turned(angle: float) -> torch.Tensor:
 
 
 def test_does_not_depend_on_the_axes_for_other_shapes():
-    """An egg, random points, and a triangle, around which boxes along each side have the same area."""
+    """Test an egg, random points, and a triangle, for which the boxes along each of its sides have equal area."""
     rng = torch.Generator().manual_seed(0)
     triangle = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0.25, 0]]).double()
     for points in (

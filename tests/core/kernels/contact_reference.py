@@ -1,15 +1,15 @@
-"""The solver of `stages.core.kernels.field.contact_solve` by PyTorch, for one scene.
+"""Reference for the solver of `stages.core.kernels.field.contact_solve` in PyTorch, for one scene.
 
-With M for the bodies' inertia, the velocities v minimise the convex function
+With the bodies' inertia M, the velocities v minimise the convex function
 
-    (v - v0)' M (v - v0) / 2 + sum of the potentials of the contacts' impulses,
+    (v - v0)' M (v - v0) / 2 + sum of the potentials of the contact impulses,
 
-where v0 are the velocities without contact. The impulse along a normal, (target - normal speed) / R_n, never pulls;
-that across it, -slip / R_t, is at most friction times the normal impulse in the minimum before, a fixed point that few
-rounds reach. R_n and R_t are small fractions of the inverse effective mass, so that contacts are as stiff as a step
-resolves. Minimised by Newton's method with a line search.
+where v0 are the velocities without contact. The normal impulse (target - normal speed) / R_n is never negative. The
+tangential impulse -slip / R_t is limited to friction times the normal impulse of the previous minimum, which is a fixed
+point iteration that converges in few rounds. R_n and R_t are small fractions of the inverse effective mass, so that
+contacts are as stiff as a step resolves. The minimum is found by Newton's method with a line search.
 Sources: Castro, Permenter and Han 2022, "An unconstrained convex formulation of compliant contact"; friction bounded by
-the normal forces before: Castro et al. 2023, "A theory of irrotational contact fields".
+the previous normal forces: Castro et al. 2023, "A theory of irrotational contact fields".
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-NORMAL_REGULARISATION, FRICTION_REGULARISATION = 1e-3, 1e-3  # of the inverse effective mass
-ROUNDS = 5  # of the fixed point, at most
-ITERATIONS = 20  # of Newton's method in each round, at most
-TOLERANCE = 1e-6  # change of velocities at which both end [m/s]
+NORMAL_REGULARISATION, FRICTION_REGULARISATION = 1e-3, 1e-3  # R_n and R_t [inverse effective masses]
+ROUNDS = 5  # maximum number of fixed point iterations
+ITERATIONS = 20  # maximum number of Newton iterations in each round
+TOLERANCE = 1e-6  # change of velocities at which both iterations stop [m/s]
 SEARCHED = 2.0 ** -torch.arange(16)  # step sizes between which the line search interpolates
-PINNED_MASS = 1e6  # of a body that does not move, relative to the heaviest
+PINNED_MASS = 1e6  # mass of a pinned body, relative to the heaviest body
 
 
 class Contacts(NamedTuple):
-    """Contact points r of a body a with a body b, or with what is fixed (b = a)."""
+    """r contact points of a body a with a body b, or with a fixed surface (b = a)."""
 
     a: Int[Tensor, "r"]
     b: Int[Tensor, "r"]
-    fixed: Tensor  # r; whether b is fixed
+    fixed: Tensor  # r; whether the other side is a fixed surface
     normal: Float[Tensor, "r 3"]  # from b to a
-    arm_a: Float[Tensor, "r 3"]  # from the centres of mass [m]
+    arm_a: Float[Tensor, "r 3"]  # from the centre of mass to the contact point [m]
     arm_b: Float[Tensor, "r 3"]
-    target: Float[Tensor, "r"]  # least normal speed of a relative to b after the step [m/s]
+    target: Float[Tensor, "r"]  # smallest normal speed of a relative to b after the step [m/s]
     friction: Float[Tensor, "r"]
 
 
@@ -47,21 +47,21 @@ class BodyInertia(NamedTuple):
     mass: Float[Tensor, "o"]  # [kg]
     inertia: Float[Tensor, "o 3 3"]  # about the centres of mass [kg m^2]
     inverse: Float[Tensor, "o 3 3"]
-    velocity: Float[Tensor, "o 6"]  # of the centres of mass [m/s], and angular [rad/s]
+    velocity: Float[Tensor, "o 6"]  # linear, of the centres of mass [m/s], then angular [rad/s]
     pinned: Tensor  # o
 
 
 def solve(
     bodies: BodyInertia, contacts: Contacts, start: Float[Tensor, "o 6"]
 ) -> tuple[Float[Tensor, "o 6"], Float[Tensor, "r 3"]]:
-    """Velocities of the bodies after the step, and the impulses [N s] on the bodies a; double precision.
+    """Velocities of the bodies after the step, and the impulses on the bodies a [N s], in double precision.
 
-    `start`: velocities to begin with.
+    `start` holds the initial velocities of the iteration.
     """
     system = _System(bodies, contacts)
     v = torch.where(bodies.pinned[:, None], 0.0, start)
     bound = torch.zeros_like(contacts.target)
-    for k in range(ROUNDS):  # the first without friction
+    for k in range(ROUNDS):  # the first round is without friction
         if k:
             bound = contacts.friction * system.impulses(system.relative(v), bound)[1]
         before = v
@@ -89,7 +89,7 @@ class _System:
         c = contacts
         response = _response(movable[c.a] / bodies.mass[c.a], movable[c.a, None, None] * bodies.inverse[c.a], c.arm_a)
         other = _response(movable[c.b] / bodies.mass[c.b], movable[c.b, None, None] * bodies.inverse[c.b], c.arm_b)
-        response = response + torch.where(c.fixed, 0.0, other)  # inverse effective mass, mean of all directions
+        response = response + torch.where(c.fixed, 0.0, other)  # inverse effective mass, averaged over all directions
         self.R_n, self.R_t = NORMAL_REGULARISATION * response, FRICTION_REGULARISATION * response
         # wrench of a force at the contact point on each body: r 6 3
         self.P_a = torch.cat([eye.expand(len(c.a), 3, 3), _cross(c.arm_a)], 1)
@@ -97,13 +97,14 @@ class _System:
         self.P_b = torch.where(c.fixed[:, None, None], 0.0, -self.P_b)
 
     def relative(self, v: Float[Tensor, "*s o 6"]) -> Float[Tensor, "*s r 3"]:
-        """Velocities of the points of a relative to b."""
+        """Velocities of the contact points of a relative to b."""
         c = self.contacts
         return (v[..., c.a, None, :] @ self.P_a)[..., 0, :] + (v[..., c.b, None, :] @ self.P_b)[..., 0, :]
 
     def impulses(self, relative: Float[Tensor, "*s r 3"], bound: Float[Tensor, "r"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Impulses on the bodies a (*s r 3), along the normals (*s r), and per slip across them (*s r), for velocities
-        of a relative to b.
+        """Impulses on the bodies a (*s r 3), their normal components (*s r), and tangential impulse per slip (*s r).
+
+        `relative` are the velocities of a relative to b.
         """
         n = self.contacts.normal
         speed = (relative * n).sum(-1)
@@ -113,7 +114,7 @@ class _System:
         return along[..., None] * n - across[..., None] * slip, along, across
 
     def newton_step(self, v: Float[Tensor, "o 6"], bound: Float[Tensor, "r"]) -> Float[Tensor, "o 6"]:
-        """The velocities after one of Newton's steps; friction is at most `bound`."""
+        """The velocities after one Newton step; the tangential impulse is at most `bound`."""
         c, n, o, eye = self.contacts, self.contacts.normal, len(v), torch.eye(3).to(v)
         relative = self.relative(v)
         impulse, along, across = self.impulses(relative, bound)
@@ -137,31 +138,31 @@ class _System:
         return v + self._step_size(v, step, relative, bound) * step
 
     def _step_size(self, v: Tensor, step: Tensor, relative: Tensor, bound: Tensor) -> Tensor:
-        """Where the derivative along the step vanishes, at most 1."""
+        """Step size at which the derivative along the step vanishes, at most 1."""
         sizes = SEARCHED.to(v)
         along = self.relative(step)
         pushed = self.M @ step[..., None]
         inertial = ((v - self.free)[..., None] * pushed).sum() + sizes * (step[..., None] * pushed).sum()
         impulse, _, _ = self.impulses(relative + sizes[:, None, None] * along, bound)
-        slope = inertial - (impulse * along).sum((-1, -2))  # falls with the size
+        slope = inertial - (impulse * along).sum((-1, -2))  # decreases with the step size
         if float(slope[0]) <= 0:
             return sizes[0]
-        row = int((slope > 0).sum())  # first with a negative slope
+        row = int((slope > 0).sum())  # first step size with a negative slope
         if row == len(sizes):
             return sizes[-1]
         high, low = slope[row - 1], slope[row]
-        # where rounding decides on the signs the step is too small to matter
+        # if rounding determines the signs, the step is too small to matter
         return sizes[row] + (sizes[row - 1] - sizes[row]) * (low / (low - high)).nan_to_num(0.0).clamp(0, 1)
 
 
 def _cross(x: Float[Tensor, "r 3"]) -> Float[Tensor, "r 3 3"]:
-    """Matrices of the cross products with x from the left."""
+    """Matrices that compute the cross product with x from the left."""
     zero = torch.zeros_like(x[:, 0])
     a, b, c = x.unbind(1)
     return torch.stack([zero, -c, b, c, zero, -a, -b, a, zero], 1).view(-1, 3, 3)
 
 
 def _response(inverse_mass: Tensor, inverse: Tensor, arm: Tensor) -> Float[Tensor, "r"]:
-    """Speed that a unit impulse at `arm` gives its point, the mean over all directions."""
+    """Velocity response of a point at `arm` to a unit impulse there, averaged over all directions."""
     K = _cross(arm)
     return inverse_mass + (K.mT @ inverse @ K).diagonal(dim1=-2, dim2=-1).sum(-1) / 3

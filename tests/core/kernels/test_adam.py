@@ -1,4 +1,4 @@
-"""A step of Adam against PyTorch's optimiser."""
+"""The Adam step, compared with PyTorch's optimiser."""
 
 import torch
 

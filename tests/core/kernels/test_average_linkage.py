@@ -8,7 +8,7 @@ from stages.core.kernels.average_linkage import average_linkage, average_linkage
 
 @pytest.mark.parametrize("clusters, edges", [(2, 1), (40, 60), (300, 2500), (50, 1225)], ids=str)
 def test_merges_equal_the_reference(clusters, edges):
-    """In order and bit for bit, with many weights that are equal, and with lone clusters and hubs."""
+    """Equal in order and bitwise, with many tied weights, isolated clusters and hubs."""
     rng = torch.Generator().manual_seed(edges)
     pairs = torch.combinations(torch.arange(clusters))
     ends = pairs[torch.randperm(len(pairs), generator=rng)[:edges]]

@@ -1,4 +1,4 @@
-"""Constitutive models at one material point against theory."""
+"""Constitutive models at a single material point, compared with theory."""
 
 import math
 
@@ -188,7 +188,7 @@ def test_maxwell_branches_dissipate_alike_over_a_decade(loss):
     modulus, rate = materials.maxwell_branches(loss, omega)
 
     def measured(w: float) -> float:
-        """tan(delta) of a unit spring beside the branches, each of complex modulus m i w / (k + i w)."""
+        """tan(delta) of a unit spring in parallel with branches of complex modulus m i w / (k + i w)."""
         E = 1 + sum(m * 1j * w / (k + 1j * w) for m, k in zip(modulus, rate, strict=True))
         return E.imag / E.real
 

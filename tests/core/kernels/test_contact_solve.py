@@ -1,4 +1,4 @@
-"""The contact solve against mechanics, a box on a floor and two balls that collide, and against another solver."""
+"""The contact solver, compared with mechanics (a box on a floor, two colliding balls) and with the reference solver."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.kernels.interop import launch, with_arrays
 from tests.core.kernels import contact_reference as reference
 from tests.core.kernels.contact_reference import BodyInertia, Contacts
 
-GROUP = {"cpu": 1, "cuda": 64}  # threads
+GROUP = {"cpu": 1, "cuda": 64}  # threads per scene
 
 
 @wp.kernel(enable_backward=False)
@@ -29,7 +29,7 @@ def _solve(solver: ContactSolver, lanes: int):
 def solve(
     bodies: BodyInertia, contacts: Contacts, start: torch.Tensor, device: str
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The reference's `solve` by the kernels."""
+    """`solve` of the reference, computed by the kernels."""
     o, group = len(bodies.mass), GROUP[device]
     pair = contacts.a * o + contacts.b
     order = pair.argsort(stable=True)
@@ -76,7 +76,7 @@ DT, G, MASS = 0.005, 5.0, 2.0
 
 
 def box_on_floor(device, speed, friction, tilt=0.0):
-    """One step of a box of .3 x .3 x .2 m whose lower face has 49 contacts; gravity is tilted by `tilt` about y."""
+    """One step of a box of .3 x .3 x .2 m with 49 contacts on its lower face; gravity is tilted by `tilt` about y."""
     line = torch.linspace(-0.15, 0.15, 7).double()
     arm = torch.cat([torch.cartesian_prod(line, line), torch.full((49, 1), -0.1).double()], 1)
     zero, inertia = torch.zeros(49, dtype=torch.int64), MASS * torch.tensor([0.0108, 0.0108, 0.015]).double().diag()
@@ -104,7 +104,7 @@ def test_a_sliding_box_slows_down_by_friction_times_gravity(device, friction):
 
 @pytest.mark.parametrize(("degrees", "holds"), [(10, True), (16, True), (17.5, False), (30, False)])
 def test_a_slope_holds_up_to_the_friction_angle(device, degrees, holds):
-    tilt, friction = math.radians(degrees), 0.3  # 16.7 degrees
+    tilt, friction = math.radians(degrees), 0.3  # friction angle 16.7 degrees
     _, velocity, _ = box_on_floor(device, 0.0, friction, tilt)
     pull = 0.0 if holds else G * (math.sin(tilt) - friction * math.cos(tilt)) * DT
     assert float(velocity[0, 0]) == pytest.approx(pull, abs=1e-5)
@@ -112,7 +112,7 @@ def test_a_slope_holds_up_to_the_friction_angle(device, degrees, holds):
 
 @pytest.mark.parametrize("speed", [0.0, 0.003, 2.0])
 def test_the_impulse_is_in_the_friction_cone(device, speed):
-    """Their sum: how 49 contacts of a rigid face share friction is hardly determined."""
+    """Checks the sum, since the distribution of friction over 49 contacts of a rigid face is nearly indeterminate."""
     contacts, _, impulse = box_on_floor(device, speed, 0.5, 0.2)
     along = (impulse * contacts.normal).sum(-1)
     across = (impulse - along[:, None] * contacts.normal).sum(0).norm()
@@ -120,7 +120,7 @@ def test_the_impulse_is_in_the_friction_cone(device, speed):
 
 
 def two_balls(device, pinned):
-    """Balls of 1 and 3 kg that meet off their centres, and should separate at .6 m/s."""
+    """Balls of 1 and 3 kg in an off-centre collision, whose target speed of separation is .6 m/s."""
     mass, radius = torch.tensor([1.0, 3.0]).double(), 0.1
     inertia = 0.4 * mass[:, None, None] * radius**2 * torch.eye(3).double()
     velocity = torch.zeros(2, 6).double()
@@ -138,7 +138,7 @@ def test_a_collision_keeps_momentum_and_separates_at_the_target(device):
     mass, before = bodies.mass[:, None], bodies.velocity
     torch.testing.assert_close((mass * after[:, :3]).sum(0), (mass * before[:, :3]).sum(0))
     assert float(after[1, 0] - after[0, 0]) == pytest.approx(0.6, rel=0.02)  # contacts are stiff, not rigid
-    assert float(impulse[0, 1]) == pytest.approx(0.05 * float(impulse[0, 0]), rel=1e-4)  # it slips
+    assert float(impulse[0, 1]) == pytest.approx(0.05 * float(impulse[0, 0]), rel=1e-4)  # the contact slips
     spin = torch.linalg.cross(contacts.arm_a[0], impulse[0]) / bodies.inertia[0, 0, 0]
     torch.testing.assert_close(after[0, 3:], spin)
 
@@ -150,7 +150,7 @@ def test_a_pinned_body_stays(device):
 
 
 def test_equals_another_solver(device):
-    """Seven bodies, two of them pinned, with random contacts: two islands, one body without any contact."""
+    """Seven bodies, two of them pinned, with random contacts: two islands, and one body without contacts."""
     rng, o, r = torch.Generator().manual_seed(3), 7, 40
 
     def normal(*shape):

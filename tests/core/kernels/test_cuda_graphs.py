@@ -10,7 +10,7 @@ from stages.core.kernels.cuda_graphs import captured
 
 @pytest.mark.gpu
 def test_nothing_is_collected_while_launches_are_captured():
-    """A graph in a cycle is freed by the collector, which at this threshold runs at every allocation of an object."""
+    """A CUDA graph in a reference cycle is freed by the garbage collector, which here runs at every allocation."""
     x = torch.zeros(4, device="cuda")
     x += 1
     unused = [captured(lambda: x.add_(1))]

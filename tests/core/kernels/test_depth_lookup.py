@@ -1,4 +1,4 @@
-"""Lookup in depths below surfaces: the kernels against NumPy, and a ball's analytic distances."""
+"""Lookup in signed-distance grids: kernels compared with NumPy, and analytic distances of a ball."""
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ kernels = pytest.mark.skipif(not compiles_for_cpu(), reason="Warp has no compile
 
 
 def scene(count: int):
-    """Grids and samples of three bodies at random poses, and samples that are looked up from body a in body b.
+    """Grids and samples of three bodies with random poses, and samples of body a that are looked up in body b.
 
-    Samples have one to three faces or none, of which some are opposed to those of others.
+    Samples have zero to three faces, some of which oppose those of others.
     """
     rng = np.random.default_rng(count)
     shapes = [(5, 6, 7), (4, 3, 9), (8, 8, 2)]
@@ -39,7 +39,7 @@ def scene(count: int):
 
 
 @kernels
-@pytest.mark.parametrize("counts", [(0, 7), (300, 5000, 40)])  # buffers grow, and are not cleared in between
+@pytest.mark.parametrize("counts", [(0, 7), (300, 5000, 40)])  # buffers grow and are not cleared in between
 def test_kernels_agree_with_numpy(counts):
     grids, *_ = scene(1)
     compiled, numpy = CompiledDepthLookup(*grids), DepthLookup(*grids)
@@ -49,17 +49,17 @@ def test_kernels_agree_with_numpy(counts):
         distance = numpy.distances(points, a, b, *poses)
         np.testing.assert_allclose(compiled.distances(points, a, b, *poses), distance, atol=1e-12)
         found, wanted = (x.inside(sample, a, b, *poses) for x in (compiled, numpy))
-        assert len(wanted.row) >= count // 50  # some are inside
+        assert len(wanted.row) >= count // 50  # some points are inside
         for one, other in zip(found, wanted, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-10)
-        if count == 5000:  # every rule has chosen some normals
+        if count == 5000:  # every rule has determined some normals
             own = np.einsum("kij,kj->ki", poses[0][a], grids[-1].normals[sample])[wanted.row]
             of_sample, on_face = np.isclose(wanted.normal, -own).all(1), grids[-1].flatness[sample[wanted.row]] > 0
             assert min(of_sample.sum(), (on_face & ~of_sample).sum(), (~on_face).sum()) > 10
 
 
 def test_the_normal_is_that_of_the_flatter_of_parallel_faces_else_of_the_sample_on_a_face():
-    """A sample at the top of one body is .02 inside the underside of another, whose nearest sample is the other one."""
+    """A sample on top of one body lies .02 inside the underside of another, whose nearest sample is the second one."""
     line = np.arange(-0.2, 0.21, 0.1)
     height = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., 2]
     up, aslant = np.array([0.0, 0, 1]), np.array([0.0, 0.28, 0.96])
@@ -76,24 +76,24 @@ def test_the_normal_is_that_of_the_flatter_of_parallel_faces_else_of_the_sample_
             assert found.depth == pytest.approx([0.02]) and found.x == pytest.approx(np.array([[0, 0, 0.02]]))
             yield found.normal[0].round(9).tolist(), float(found.facing[0])
 
-    for found, facing in normal((0.98, 1.0), (up, -aslant)):  # parallel enough: of the flatter one
+    for found, facing in normal((0.98, 1.0), (up, -aslant)):  # nearly parallel: the normal of the flatter face is used
         assert found == (-aslant).tolist() and facing == pytest.approx(0.96)
     for found, _ in normal((1.0, 0.98), (up, -aslant)):
         assert found == (-up).tolist()
-    for found, facing in normal((0.98, 1.0), (up, [0, -0.8, -0.6])):  # not parallel: that of the sample
+    for found, facing in normal((0.98, 1.0), (up, [0, -0.8, -0.6])):  # not parallel: the normal of the sample is used
         assert found == (-up).tolist() and facing == pytest.approx(0.6)
-    for found, facing in normal((0.0, 1.0), ([0, 0, 0], -up)):  # at an edge: against the slope of the depths
+    for found, facing in normal((0.0, 1.0), ([0, 0, 0], -up)):  # at an edge: the negative gradient of the depth is used
         assert found == (-up).tolist() and facing == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("make", [DepthLookup, pytest.param(CompiledDepthLookup, marks=kernels)])
 def test_distances_and_contacts_of_a_ball(make):
-    """A ball of radius 1 about (2, 0, 0), and points of a body that is turned by 90 degrees about z."""
+    """A ball of radius 1 at (2, 0, 0), and points of a body that is rotated by 90 degrees about z."""
     line = np.arange(-1.2, 1.21, 0.05)
     x = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
     ball = 1 - np.linalg.norm(x, axis=-1)
     at_edges = np.zeros((3, 3, 3)), np.full(2 * ball.size, -1)
-    points = np.array([[0.0, -1.1, 0], [0, -0.5, 0], [0, 5, 0]])  # at x = 1.1, .5 and -5
+    points = np.array([[0.0, -1.1, 0], [0, -0.5, 0], [0, 5, 0]])  # at x = 1.1, .5 and -5 in world coordinates
     samples = Samples(points, np.array([[0.0, -1, 0]] * 3), np.zeros(3), *at_edges)
     lookup = make([ball, ball], np.full((2, 3), -1.2), np.full(2, 0.05), samples)
     turn = np.stack([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], np.eye(3)])
@@ -101,12 +101,13 @@ def test_distances_and_contacts_of_a_ball(make):
     zeros, ones = np.zeros(3, np.int64), np.ones(3, np.int64)
     distance = lookup.distances(points, zeros, ones, turn, at)
     assert distance[0] == pytest.approx(-0.1, abs=2e-3)
-    assert 0.3 < distance[1] <= 0.5 and 5.7 < distance[2] <= 6  # bounds for points outside of the grid
+    assert 0.3 < distance[1] <= 0.5 and 5.7 < distance[2] <= 6  # bounds for points outside the grid
     found = lookup.inside(np.arange(3), zeros, ones, turn, at)
     assert found.row.tolist() == [0] and found.depth == pytest.approx([0.1], abs=2e-3)
     np.testing.assert_allclose(found.x, [[1.1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(found.normal, [[-1, 0, 0]], atol=0.03)  # half a cell over the radius: it is on a node
-    assert found.facing == pytest.approx([1.0], abs=0.01)  # by the sample's normal, for want of faces
+    # half a cell over the radius, for a point on a node
+    np.testing.assert_allclose(found.normal, [[-1, 0, 0]], atol=0.03)
+    assert found.facing == pytest.approx([1.0], abs=0.01)  # from the normal of the sample, which has no faces
     near = lookup.near(np.arange(3), zeros, ones, turn, at - np.array([[0, 0, 0], [0.15, 0, 0]]), 0.06)
     assert near.row.tolist() == [0]
 

@@ -1,4 +1,4 @@
-"""The stand-alone Triton kernels of the force field against their references in double precision."""
+"""The stand-alone Triton kernels of the force field, compared with their references in double precision."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Structs of tensors for kernels, and Warp without its compiler for the CPU."""
+"""Kernel structs made from tensors, and Warp without its CPU compiler."""
 
 import os
 import subprocess

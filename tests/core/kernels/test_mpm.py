@@ -1,4 +1,4 @@
-"""The MPM substep against its PyTorch specification; reproducibility and clean-up of the launch orders."""
+"""The MPM substep, compared with its PyTorch specification; reproducibility and clearing of the launch schedules."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def cloud(p: int = 300, seed: int = 0) -> mpm.Particles:
 
 
 def viscoelastic_cloud() -> mpm.Particles:
-    """The same with strained Maxwell branches."""
+    """The same particles with strained Maxwell branches."""
     rng = torch.Generator().manual_seed(1)
     p = cloud()
     p = mpm.with_branches(p, torch.rand(len(p), 2, generator=rng), 500 * torch.rand(len(p), 2, generator=rng))
@@ -67,7 +67,7 @@ def test_result_is_bit_identical_for_any_number_of_threads(monkeypatch):
 
 
 def test_grid_is_zero_after_a_frame():
-    # momentum scattered in one substep must be cleared before the next, also where particles have left
+    # momentum scattered in one substep must be cleared before the next, even where particles have left
     solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
     solver.advance(0.05, torch.zeros(300, 3))
     assert not solver._substepper._momentum.any()

@@ -1,4 +1,4 @@
-"""Nearest rotations against the singular value decomposition."""
+"""Nearest rotations, compared with the singular value decomposition."""
 
 import pytest
 import torch

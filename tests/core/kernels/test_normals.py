@@ -1,4 +1,4 @@
-"""Normals, spacings and inverses against the full distance matrix and LAPACK in double precision."""
+"""Normals, spacings and inverses, compared with the full distance matrix and LAPACK in double precision."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The fused loss of a rendered photo against plain PyTorch."""
+"""The fused photometric loss, compared with plain PyTorch."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ HEIGHT, WIDTH = 37, 50
 
 
 def inputs(device: str) -> tuple:
-    """Images of which some values are equal, and depths of which some are unknown or below the minimum."""
+    """Images with some equal values, and depths of which some are unknown or below the minimum."""
     rng = torch.Generator().manual_seed(0)
     photo = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=rng, dtype=torch.uint8)
     rgb = (photo.float() / 255 + 0.2 * torch.randn(HEIGHT, WIDTH, 3, generator=rng)).clamp_min(0)

@@ -1,4 +1,4 @@
-"""The rigid-motion kernels against their tensor form in double precision."""
+"""The rigid-motion kernels, compared with their tensor form in double precision."""
 
 import torch
 
@@ -23,10 +23,10 @@ def test_drift_and_pose_equal_their_tensor_form(device):
     wanted = [*rigid.drift(*exact, 0.1), *rigid.pose(exact[1], exact[3], exact[4])]
     for ours, theirs in zip(found, wanted, strict=True):
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=2e-6)  # rotations of up to 3 rad in float32
-    alone = quat[0, 0] / quat[0, 0].norm()  # no momentum: only normalised again
+    alone = quat[0, 0] / quat[0, 0].norm()  # without angular momentum the quaternion is only normalised
     if device == "cpu":
         assert torch.equal(found[1][0, 0], alone)
-    else:  # the norm is rounded differently
+    else:  # the norm is rounded differently on this device
         torch.testing.assert_close(found[1][0, 0], alone, rtol=0, atol=2e-7)
 
 

@@ -20,7 +20,7 @@ def test_path_costs_do_not_depend_on_the_number_of_threads(with_threads):
 
 
 def test_path_cost_of_a_line_without_changes_is_the_sum_of_its_costs(device):
-    """With penalties above any saving, the best path keeps its label: forward plus backward counts each step twice."""
+    """With penalties above any saving, the best path keeps its label; the two passes count each step twice."""
     costs = torch.zeros(6, 1, 4, device=device)
     costs[:, :, 1:] = 1.0
     total = path_costs(costs, 10.0, 10.0)

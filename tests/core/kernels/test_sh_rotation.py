@@ -1,4 +1,4 @@
-"""The rotation of spherical harmonics against that in PyTorch."""
+"""Rotation of spherical harmonics, compared with the PyTorch implementation."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from stages.core.kernels.sh_rotation import rotate_each_sh
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 16, 1003])
 def test_rotated_coefficients_equal_the_reference(degree, n, device):
-    """And those with the identity rotation the input, bit for bit."""
+    """The identity rotation also returns the input bitwise."""
     rng = torch.Generator().manual_seed(n + degree)
     sh = torch.randn(n, (degree + 1) ** 2, 3, generator=rng)
     R = matrix(torch.randn(n, 4, generator=rng))

@@ -1,4 +1,4 @@
-"""The skinning kernel against its PyTorch reference."""
+"""The skinning kernel, compared with its PyTorch reference."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_skinning_equals_its_reference(device):
     size = theirs.flatten(1).abs().amax(1)[:, None, None]
     torch.testing.assert_close(ours / size, theirs / size, rtol=0, atol=2e-5)
     F = exact_gradient(*in_double(*args)[:2])
-    regular = (torch.linalg.svdvals(F)[:, -1] > 0.1) & (torch.linalg.det(F) > 1e-3)  # else the rotation is ill-defined
+    regular = (torch.linalg.svdvals(F)[:, -1] > 0.1) & (torch.linalg.det(F) > 1e-3)  # others have ill-defined rotations
     torch.testing.assert_close(R.double()[regular], exact[3][regular], rtol=0, atol=1e-4)
 
 

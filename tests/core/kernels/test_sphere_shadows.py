@@ -1,4 +1,4 @@
-"""Light blocked by spheres, against plain PyTorch."""
+"""Light blocked by spheres, compared with plain PyTorch."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ LAMPS = [Lamp((0.6, 0.0, 0.8), 0.2), Lamp((0.0, 0.0, 1.0), 0.6)]
 
 
 def world(device: str, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor, Spheres]:
-    """Points, and four objects of eight spheres, one so large and near that products of a few factors would vanish."""
+    """Points, and four objects of eight spheres; one is so large and near that the transmitted light would vanish."""
     rng = torch.Generator().manual_seed(0)
     points = torch.rand(3000, 3, generator=rng) * torch.tensor([2.0, 2.0, 0.5]) - torch.tensor([1.0, 1.0, 0.1])
     own = torch.randint(0, 6, (3000,), generator=rng)
@@ -28,7 +28,7 @@ def test_equals_the_reference(device, lamp):
     mine = blocked_light(*world(device), lamp).cpu()
     assert mine.shape == (3000, 2) and 0.05 < float(exact.mean()) < 0.95
     error = (mine - exact).abs()
-    assert float(error.quantile(0.999)) < 1e-5  # but where rounding decides whether an object is near
+    assert float(error.quantile(0.999)) < 1e-5  # except where rounding determines whether an object is near
     assert float(error.max()) < 0.02
     assert float(exact.max()) > 0.999
 

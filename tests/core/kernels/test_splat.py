@@ -1,4 +1,4 @@
-"""The kernels of the rasteriser (projection, binning, compositing) against their references."""
+"""The kernels of the rasteriser (projection, binning, compositing), compared with their references."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from stages.core.kernels.splat.projection import BIN_SIZE, TILE_SIZE, pack_camer
 from stages.core.kernels.splat.tiles import Capacity, bin_tiles
 from tests.conftest import random_gaussians, ring
 
-WIDTH, HEIGHT = 71, 53  # no multiples of block, bin or lane counts
+WIDTH, HEIGHT = 71, 53  # not multiples of block, bin or lane counts
 
 
 def view_of(gaussians, closer: float = 0.0, size=(WIDTH, HEIGHT)):
@@ -71,9 +71,9 @@ def test_quaternion_norm_has_no_effect():
 def test_gaussians_outside_the_view_or_nan_are_not_visible():
     gaussians = random_gaussians(6)
     eye = -ring().viewmats[1][:3, :3].T @ ring().viewmats[1][:3, 3]
-    gaussians.means[0] = 2 * eye  # behind
+    gaussians.means[0] = 2 * eye  # behind the camera
     gaussians.means[1] = eye  # at the camera centre
-    gaussians.means[2] = torch.tensor([0.0, 0.0, 50.0])  # above
+    gaussians.means[2] = torch.tensor([0.0, 0.0, 50.0])  # above the image
     gaussians.means[3] = float("nan")
     gaussians.opacities[4] = 0.9 / 255  # below the minimum alpha
     gaussians.means[5] = 0.0
@@ -95,7 +95,8 @@ def test_bins_hold_overlapping_splats_nearest_first(n):
     low, high = splats[order, :2] - splats[order, 11:13], splats[order, :2] + splats[order, 11:13]
     for b in range(len(bins.starts) - 1):
         corner = torch.tensor([b % across, b // across]) * BIN_SIZE
-        touches = ((low <= corner + BIN_SIZE - 0.5) & (high >= corner + 0.5)).all(1)  # a pixel centre between its edges
+        # contains a pixel centre of the bin
+        touches = ((low <= corner + BIN_SIZE - 0.5) & (high >= corner + 0.5)).all(1)
         members = bins.members[bins.starts[b] : bins.starts[b + 1]]
         assert set(order[touches].tolist()) <= set(members.tolist())
         assert torch.equal(members.long(), order[torch.isin(order, members)])
@@ -114,7 +115,7 @@ def test_balanced_bounds_cover_all_bins():
     assert even_bounds(10, 3) == [0, 3, 6, 10]
 
 
-# opacity 3: most splats clamp at alpha 0.999 and many pixels finish early
+# with opacity 3, most splats are clamped to alpha 0.999 and many pixels finish early
 @pytest.mark.parametrize("opacity", [0.1, 1.0, 3.0])
 def test_compositing_equals_its_reference(opacity, device):
     splats, bins = random_splats(400, opacity, device=device)
@@ -234,7 +235,7 @@ def test_results_do_not_depend_on_the_number_of_threads(request):
         images = composite(splats, bins, mean=True)
         grads = torch.autograd.grad(sum(image.square().sum() for image in images), [splats, *leaves])
         results.append([bins.members, *images, *grads, *composite_with_dominant(splats.detach(), bins)[3:]])
-    assert results[0][4].abs().sum() > 0 and len(results[0][0]) > 1.2 * 3000  # splats in several bins
+    assert results[0][4].abs().sum() > 0 and len(results[0][0]) > 1.2 * 3000  # splats cover several bins
     for others in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
 

@@ -1,4 +1,4 @@
-"""SSIM against scipy, analytic values and finite differences."""
+"""SSIM, compared with scipy, analytic values and finite differences."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Closest points of bodies: of convex ones against projection by non-negative least squares, of a torus in closed form.
+"""Closest points on bodies: convex ones compared with projection by non-negative least squares, a torus analytically.
 
 Source: least distance programming, Lawson and Hanson 1974, "Solving Least Squares Problems", chapter 23.
 """
@@ -25,7 +25,7 @@ def _closest(s: SurfaceArrays, x: wp.array[wp.vec3], at: wp.array[wp.vec3], norm
 
 
 def closest(surface: BodyGrid, x: Tensor, device: str) -> tuple[Tensor, Tensor]:
-    """Closest points and normals there, on the CPU."""
+    """Closest points and the normals there, on the CPU."""
     surfaces = BodySurfaces.of([surface]).to(device)
     x = x.to(device)
     at, normal = torch.empty_like(x), torch.empty_like(x)
@@ -35,7 +35,7 @@ def closest(surface: BodyGrid, x: Tensor, device: str) -> tuple[Tensor, Tensor]:
 
 
 def grid_of(depth: Tensor, low: Tensor, spacing: float, samples: Tensor, hull: Tensor) -> BodyGrid:
-    """A body with these depths and samples of its surface."""
+    """A body with these depths and surface samples."""
     rows, row = torch.zeros(depth.shape, dtype=torch.long), torch.zeros(len(samples), dtype=torch.long)
     return BodyGrid(depth, depth, rows, low, spacing, samples, samples, row, row, torch.ones(1), torch.zeros(1, 3, 3),
                     rows, hull=hull)  # fmt: skip
@@ -50,7 +50,7 @@ def projected(normals: np.ndarray, offsets: np.ndarray, x: np.ndarray) -> np.nda
 
 
 def test_of_a_polyhedron(device):
-    """Of random facets, of a cube, and of a prism with many sides, whose planes meet in narrow wedges."""
+    """Random facets, a cube, and a prism with many sides, whose planes meet in narrow wedges."""
     rng = np.random.default_rng(0)
     sides = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     prism = np.concatenate([np.stack([np.cos(sides), np.sin(sides), 0 * sides], 1), [[0, 0, 1], [0, 0, -1]]])
@@ -74,7 +74,7 @@ def test_of_a_polyhedron(device):
 
 
 def test_of_a_torus_on_a_grid(device):
-    """From outside and in its hole. The slopes of a grid are wrong by half its spacing over the radius of curvature."""
+    """From outside and from the hole. Gradients on a grid have an error of half its spacing over the curvature radius."""
     spacing, ring, tube = 0.02, 0.5, 0.2
     low = torch.tensor([-0.8, -0.8, -0.3])
     nodes = torch.stack(torch.meshgrid(*(torch.arange(n) for n in (81, 81, 31)), indexing="ij"), -1)
@@ -107,7 +107,7 @@ def _first_inside(s: SurfaceArrays, x: wp.array[wp.vec3], way: wp.array[wp.vec3]
 
 
 def test_a_way_meets_the_near_side_of_a_wall_of_three_nodes(device):
-    """From both sides, through it or into it; also for a ball, whose centre stays outside. To a node along the way."""
+    """From both sides, through the wall or into it, for points and for a ball; accurate to one node along the path."""
     spacing, half, outside = 0.02, 0.03, 0.05
     low, shape = torch.tensor([-0.2, -0.5, -0.5]), (21, 51, 51)
     depth = half - (low[0] + spacing * torch.arange(shape[0])).abs()[:, None, None].expand(shape).contiguous()
@@ -126,6 +126,6 @@ def test_a_way_meets_the_near_side_of_a_wall_of_three_nodes(device):
         beyond = found.cpu() - (0.15 - half - radius) / way[:, 0].abs()
         assert float(beyond.min()) > -1e-5 and float((beyond * way.norm(dim=1)).max()) < spacing + 1e-5
         assert bool((away == 1).all())
-        arrays = [view(a.to(device), wp.vec3) for a in (x, 0.05 * way)]  # too short
+        arrays = [view(a.to(device), wp.vec3) for a in (x, 0.05 * way)]  # the path ends before the wall
         launch(_first_inside, 200, [surfaces, *arrays, radius, view(found)], device=device)
         assert bool((found == 1).all())

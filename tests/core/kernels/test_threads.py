@@ -10,7 +10,7 @@ import warp as wp
 from stages.core.backends import pick_device
 from stages.core.kernels.threads import large_operation, parallel_map, run_parallel, small_operations
 
-LONGEST = 120.0  # for which a busy machine is waited for [s]
+LONGEST = 120.0  # longest wait for a busy machine [s]
 
 
 @pytest.fixture(params=[1, 2, 4])
@@ -29,7 +29,7 @@ def test_each_task_runs_once(threads, count):
 
 
 def test_results_are_in_the_order_of_the_items(threads):
-    """Also where a task has tasks of its own."""
+    """Including tasks that run tasks of their own."""
     assert parallel_map(lambda i: sum(parallel_map(lambda j: i * j, range(4))), range(7)) == [6 * i for i in range(7)]
     assert parallel_map(str, []) == []
 
@@ -38,7 +38,7 @@ def test_results_are_in_the_order_of_the_items(threads):
 def test_tasks_have_the_gradient_mode_of_the_caller(threads, mode):
     with mode():
         expected = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-        barrier = threading.Barrier(threads, timeout=LONGEST)  # so that every thread takes a task
+        barrier = threading.Barrier(threads, timeout=LONGEST)  # makes every thread take a task
 
         def task(_) -> tuple[bool, bool]:
             barrier.wait()
@@ -48,12 +48,12 @@ def test_tasks_have_the_gradient_mode_of_the_caller(threads, mode):
 
 
 def test_tasks_have_the_current_gpu_of_the_caller(threads, monkeypatch):
-    """With a stand-in for CUDA, in which each thread begins with GPU 0 too."""
+    """Uses a stand-in for CUDA, in which each thread starts with GPU 0, as in PyTorch."""
     own = threading.local()
     monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: getattr(own, "gpu", 0))
     monkeypatch.setattr(torch.cuda, "set_device", lambda gpu: setattr(own, "gpu", gpu))
-    barrier = threading.Barrier(threads, timeout=LONGEST)  # so that every thread takes a task
+    barrier = threading.Barrier(threads, timeout=LONGEST)  # makes every thread take a task
 
     def task(_) -> int:
         barrier.wait()
@@ -90,12 +90,12 @@ def test_an_exception_is_raised_after_all_tasks_have_ended(threads):
     with pytest.raises(ValueError, match="task 0"):
         run_parallel([fail, *(lambda i=i: (time.sleep(0.01), done.append(i)) for i in range(3))])
     assert sorted(done) == [0, 1, 2]
-    run_parallel([lambda: done.append(3)] * 2)  # the pool still works
+    run_parallel([lambda: done.append(3)] * 2)  # the pool is still usable
     assert done[-2:] == [3, 3]
 
 
 def test_the_calling_thread_does_the_work_that_no_helper_has_claimed(threads):
-    """Helpers that are busy elsewhere are not waited for."""
+    """The caller does not wait for helpers that are busy with other work."""
     release, all_busy, occupied = threading.Event(), threading.Event(), threading.Semaphore(0)
 
     def block():

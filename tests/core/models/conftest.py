@@ -1,4 +1,4 @@
-"""These tests run on one thread: their tensors are too small for more to help."""
+"""Runs these tests on one thread, because their tensors are too small to benefit from more."""
 
 import pytest
 
@@ -10,6 +10,6 @@ def _one_thread(one_thread):
 
 @pytest.fixture
 def empty_weight_folders(monkeypatch, tmp_path):
-    """Where weights are searched: weights/ and cache/ngff/ of the test's folder, which do not exist."""
+    """Search for weights in weights/ and cache/ngff/ of the test's folder, which do not exist."""
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

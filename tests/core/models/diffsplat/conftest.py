@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
-# not imported, which takes seconds: every worker collects these tests
+# find_spec instead of an import, which would take seconds in every worker that collects these tests
 if not (find_spec("diffusers") and find_spec("transformers")):
     pytest.skip("needs the extra diffsplat", allow_module_level=True)
 

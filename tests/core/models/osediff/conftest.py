@@ -4,14 +4,14 @@ from importlib.util import find_spec
 
 import pytest
 
-# not imported, which takes seconds: every worker collects these tests
+# find_spec instead of an import, which would take seconds in every worker that collects these tests
 if not (find_spec("diffusers") and find_spec("transformers")):
     pytest.skip("needs the extra diffsplat", allow_module_level=True)
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """Stands for $NGFF_WEIGHTS."""
+    """The folder used as $NGFF_WEIGHTS."""
     from tests.core.models.osediff.tiny_model import save_tiny_osediff
 
     return save_tiny_osediff(tmp_path_factory.mktemp("osediff_weights"))

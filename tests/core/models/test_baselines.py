@@ -1,4 +1,4 @@
-"""Layers of the baselines against independent implementations of the published formulas."""
+"""Layers of the baselines, compared with independent implementations of the published formulas."""
 
 import torch
 
@@ -9,7 +9,7 @@ from tests.core.models.dynamics_fixtures import add_padding, overlapping_objects
 
 
 def test_graph_convolution_equals_the_published_formula():
-    # x_i' = b + sum over j in N(i) and i itself of W x_j / sqrt(d_i d_j), d counting the node itself
+    # x_i' = b + sum of W x_j / sqrt(d_i d_j) over the neighbours j of i and i itself; d_i counts node i too
     torch.manual_seed(0)
     initial = add_padding(overlapping_objects(1, 2, 15), 0, 3)
     points, valid = initial.points.flatten(1, 2), initial.valid.flatten(1)

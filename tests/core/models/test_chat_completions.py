@@ -1,4 +1,4 @@
-"""The client of OpenAI's protocol, with a local server that fails in every way."""
+"""The client of OpenAI's chat protocol, tested with a local server that fails in several ways."""
 
 import pytest
 
@@ -20,19 +20,19 @@ def truncated(handler):
 
 
 def silent(handler):
-    """Until the client hangs up."""
+    """Send nothing until the client disconnects."""
     handler.rfile.read(1)
 
 
 def dripping(handler):
-    """A byte at a time, each before the timeout of the socket."""
+    """Send one byte at a time, each before the timeout of the socket."""
     handler.wfile.write(b"HTTP/1.0 200 OK\r\n\r\n")
     try:
         while True:
             handler.wfile.write(b" ")
             handler.wfile.flush()
             chat_completions.time.sleep(0.03)
-    except OSError:  # the client has gone
+    except OSError:  # the client has disconnected
         pass
 
 
@@ -65,7 +65,8 @@ def test_failing_servers(chat_server, monkeypatch, script, says):
 
 @pytest.mark.parametrize("first", [503, silent, "close", truncated, b"<html>"])
 def test_what_passes_is_tried_again(chat_server, first):
-    chat_server.script = [first, "well", "well"]  # the third for a machine too busy to answer once within the timeout
+    # the third reply is used if the machine is too slow to send the second one within the timeout
+    chat_server.script = [first, "well", "well"]
     assert ask(timeout=0.5 if first is silent else 30.0) == "well"
 
 
@@ -91,7 +92,7 @@ def test_unusable_settings_are_reported_before_anything_is_sent(chat_server, mon
         with pytest.raises(InputError, match="must begin with http"):
             ask(url=url)
     with pytest.raises(InputError, match="no connection"):
-        ask(url="http://127.0.0.1:9/v1")  # nobody listens there
+        ask(url="http://127.0.0.1:9/v1")  # no server listens on this port
     for timeout in (0.0, -1.0, float("nan"), float("inf"), 1e30):
         with pytest.raises(InputError, match="--timeout"):
             ask(timeout=timeout)

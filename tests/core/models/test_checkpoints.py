@@ -1,4 +1,4 @@
-"""Saving and loading checkpoints: round trips and error messages."""
+"""Saving and loading of checkpoints: round trips and error messages."""
 
 import json
 import math

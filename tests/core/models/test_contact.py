@@ -1,4 +1,4 @@
-"""Contact search against loops over all pairs."""
+"""Contact search, compared with loops over all pairs."""
 
 import itertools
 
@@ -34,7 +34,7 @@ def test_only_points_within_the_radius_are_found():
     assert torch.equal(near.isfinite(), distance < 0.05) and near.isfinite().any()
 
 
-@pytest.mark.parametrize("keypoints", [200, 300])  # one object after the other, and in parallel
+@pytest.mark.parametrize("keypoints", [200, 300])  # the search is sequential over objects, and parallel
 def test_culled_search_equals_all_pairs(keypoints):
     initial = overlapping_objects(2, 3, keypoints)
     (a, i), (b, j) = (f(initial.points, initial.valid, 0.1) for f in (nearest, _all_pairs))
@@ -51,7 +51,7 @@ def test_of_equally_near_points_the_first_is_found_and_nan_is_smallest():
 def test_accuracy_does_not_depend_on_the_distance_to_the_origin():
     initial = overlapping_objects(1, 2, 40)
     near = nearest(initial.points.float(), initial.valid, 1.0)[0]
-    # float32 at 64 m resolves 4e-6 m
+    # at a distance of 64 m, float32 resolves 4e-6 m
     far = nearest(initial.points.float() + 64, initial.valid, 1.0)[0]
     torch.testing.assert_close(far, near, rtol=0, atol=2e-5)
 

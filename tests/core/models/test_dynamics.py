@@ -15,7 +15,7 @@ from tests.core.models.dynamics_fixtures import (
 )
 
 STEPS = 6
-EXACT = {"rtol": 0, "atol": 1e-10}  # double precision, different order of summation
+EXACT = {"rtol": 0, "atol": 1e-10}  # double precision with a different order of summation
 
 
 @pytest.fixture(params=SMALL_CONFIGS)
@@ -264,5 +264,5 @@ def test_initial_state_has_the_given_velocities_and_spins():
     state = small_model("transformer").initial_state(initial)
     torch.testing.assert_close(centre_of_mass(initial, state.velocity), initial.velocity, **EXACT)
     arm = initial.points - centre_of_mass(initial, initial.points)[:, :, None]
-    momentum = torch.linalg.cross(arm, state.velocity).mean(2)  # angular, per mass; positive along the spin
+    momentum = torch.linalg.cross(arm, state.velocity).mean(2)  # angular momentum per mass, positive along the spin
     assert ((momentum * initial.spin).sum(-1) > 0).all()

@@ -1,4 +1,4 @@
-"""Batched 3 x 3 algebra against PyTorch's own functions."""
+"""Batched 3 x 3 algebra, compared with PyTorch's own functions."""
 
 import torch
 from torch.testing import assert_close

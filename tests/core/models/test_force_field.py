@@ -159,7 +159,7 @@ def test_body_without_contact_does_not_deform():
 
 @torch.no_grad()
 def test_deformation_scales_with_compliance_beyond_the_trained_stiffness():
-    """By linear elasticity; in the trained range the network alone depends on the stiffness."""
+    """Beyond it, deformation follows linear elasticity; within it, only the network depends on the stiffness."""
     model, initial = ForceField(hidden=8).double().eval(), overlapping_objects(1, 1, 12)
     stiffest = float(MAX_TRAINED_STIFFNESS * initial.mass[0, 0] / rest_shape_of(initial).size[0, 0])
     contact = torch.randn(1, 1, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -246,7 +246,7 @@ def test_penetration_of_floor_and_walls_is_resolved(depth):
 
 
 def test_floor_pushes_only_and_less_on_separating_points():
-    """The full force on approaching points, never a pull, and half the force at SEPARATION_SPEED."""
+    """Approaching points get the full force, points at SEPARATION_SPEED half of it, and none is pulled."""
     up, a = torch.tensor([0.0, 0, 1]), torch.tensor([[3.0, 1, 5], [3.0, 1, -50], [0, 0, 0.5]])[None, None, None]
     weight = torch.full((1, 1, 1, 3), 0.1)
 
@@ -314,7 +314,7 @@ def test_projected_field_has_no_net_force_and_torque():
     field = projected(shape, torch.randn(initial.points.shape, dtype=torch.float64))
     mass_fraction = initial.mass_fraction[..., None]
     assert (mass_fraction * field).sum(2).abs().max() < 1e-12
-    # to the 0.1 % by which the inertia is regularised
+    # the tolerance is the 0.1 % by which the inertia is regularised
     assert (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2).abs().max() < 2e-3
 
 
@@ -327,7 +327,7 @@ def test_normals_of_a_sphere_point_outwards():
     assert shape.size[0, 0] == pytest.approx(0.2, rel=1e-2)
     assert shape.spacing.mean() == pytest.approx(
         0.025, rel=0.3
-    )  # sqrt(4 pi r^2 / n) = 0.035; the nearest are closer than the average
+    )  # the mean spacing is sqrt(4 pi r^2 / n) = 0.035; the nearest points are closer
 
 
 def test_others_and_back_indices_are_inverse_to_each_other():
@@ -339,7 +339,7 @@ def test_others_and_back_indices_are_inverse_to_each_other():
 
 
 def groups_of_objects() -> InitialConditions:
-    """Objects 0 and 1, objects 2 to 4, and object 5 are each near one another; with padding."""
+    """Scenes with three groups of objects near one another: 0 and 1; 2, 3 and 4; 5. Padding is included."""
     near = overlapping_objects(2, 6)
     along = torch.tensor([0.0, 0.1, 0.9, 1.0, 1.1, 3.0], dtype=torch.float64)
     points = near.points + along[:, None, None] * torch.tensor([1.0, 0, 0])
@@ -367,7 +367,7 @@ def test_pairs_out_of_reach_do_not_matter(monkeypatch):
 
 
 def test_features_of_all_rows_equal_those_of_the_needed_ones(monkeypatch):
-    """A GPU computes all rows, and a CPU those in contact; so do their gradients."""
+    """A GPU computes all rows, a CPU those in contact; features and gradients must be equal."""
     model, found = model_with_amplified_forces(), []
     for dense in (False, True):
         monkeypatch.setattr(torch.compiler, "is_compiling", lambda dense=dense: dense)

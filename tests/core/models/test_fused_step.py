@@ -1,4 +1,4 @@
-"""The fused step of fifteen kernels against the unfused step in double precision."""
+"""The fused step of fifteen kernels, compared with the unfused step in double precision."""
 
 from dataclasses import replace
 
@@ -66,9 +66,8 @@ def step_all_ways(model: ForceField, initial, steps: int, prompt=None, pinned: b
     external = replace(external, **{k: getattr(external, k).float() for k in ("force", "torque", "start", "end")})
     assert fused_step.fits(single, scene)
     unfused, fused = start, start
-    unsupported = replace(
-        scene, shape=replace(shape, blur=half.float())
-    )  # in a precision that the kernels do not support
+    # the kernels do not support this precision
+    unsupported = replace(scene, shape=replace(shape, blur=half.float()))
     for i in range(steps):
         unfused = single.step(unsupported, unfused, 0.02 * i, 0.02, external)
         fused = fused_step.step(single, scene, fused, 0.02 * i, 0.02, external)
@@ -90,7 +89,8 @@ def test_fused_step_equals_unfused_step(hidden, initial, options):
     expected, unfused, fused, expected_points, fused_points = step_all_ways(
         model_with_amplified_forces(hidden), initial, 3, **options
     )
-    for name, reference in expected.items():  # tolerance: ten times the error of the unfused step in single precision
+    # the tolerance is ten times the error of the unfused step in single precision
+    for name, reference in expected.items():
         atol = 10 * float((unfused[name] - reference).abs().max()) + 4e-5 * float(reference.abs().max()) + 1e-6
         torch.testing.assert_close(fused[name], reference, rtol=0, atol=atol, msg=lambda m, name=name: f"{name}: {m}")
     torch.testing.assert_close(fused_points, expected_points, rtol=0, atol=1e-4)

@@ -1,4 +1,4 @@
-"""The published model: parity with recorded outputs of its code, and the shapes of its checkpoints."""
+"""The published model: equality with recorded outputs of its code, and the shapes of its checkpoints."""
 
 import json
 
@@ -23,7 +23,7 @@ from stages.core.models.initial_conditions import InitialConditions, centre_of_m
 from stages.core.models.integrate import Integration
 from tests.core.models.dynamics_fixtures import external_force
 
-CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision, different order of summation
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision with a different order of summation
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Rest shapes computed by GPU kernels against PyTorch in double precision."""
+"""Rest shapes computed by GPU kernels, compared with PyTorch in double precision."""
 
 import copy
 

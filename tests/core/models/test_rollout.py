@@ -1,4 +1,4 @@
-"""TimeStepper equals the model's own steps; on CUDA, where it is captured as a graph, to rounding."""
+"""TimeStepper equals the model's own steps; on CUDA it replays a captured graph and is equal up to rounding."""
 
 import pytest
 import torch
@@ -66,7 +66,7 @@ def test_external_forces_may_change_between_steps():
     stepper.step()
     unforced.step()
     gained = stepper.state.velocity[:, 1, 2] - unforced.state.velocity[:, 1, 2]
-    # 5 N for 0.02 s; this model assumes 0.1 kg for every object
+    # the impulse of 5 N for 0.02 s; this model assumes 0.1 kg for every object
     torch.testing.assert_close(gained, torch.full_like(before, 1.0))
 
 
@@ -84,8 +84,8 @@ def test_inputs_are_not_modified():
 def test_captured_steps_equal_model_steps_to_rounding():
     torch.manual_seed(0)
     model, initial = build("ngff").cuda().eval(), overlapping_objects(2, 3, 200).to(torch.float32).to("cuda")
-    expected = model.rollout(initial, 8).detach()  # with gradients, so without fused kernels
+    expected = model.rollout(initial, 8).detach()  # it records gradients and thus does not use the fused kernels
     actual = rollout(model, initial, 8)
     assert (expected[:, -1] - expected[:, 0]).norm(dim=-1).max() > 0.05
-    # single precision, eight steps with contacts
+    # the tolerance is for single precision and eight steps with contacts
     torch.testing.assert_close(actual, expected, rtol=0, atol=1e-5)

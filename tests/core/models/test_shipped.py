@@ -1,4 +1,4 @@
-"""Properties that the shipped weights must have after every training."""
+"""Properties that the shipped weights must have after every training run."""
 
 import copy
 import json
@@ -13,10 +13,10 @@ from stages.core.physics.keypoints import farthest_points
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import single_threaded
 
-DT = 0.02  # [s]
+DT = 0.02  # time per frame [s]
 FILES = sorted(SHIPPED.glob("*.safetensors"))
-MAX_BYTES = 5e5  # of all weights and cards
-MAX_DEPTH = 0.035  # of a keypoint in the floor [m]: MAX_PENETRATION and a margin for rounding
+MAX_BYTES = 5e5  # maximum size of all weights and cards together [B]
+MAX_DEPTH = 0.035  # maximum depth of a keypoint in the floor [m]: MAX_PENETRATION and a margin for rounding
 
 
 def box_surface(half, n, seed):
@@ -29,14 +29,14 @@ def box_surface(half, n, seed):
 
 
 def keypoints_of(name, n):
-    """Keypoints of an object at the size that it has in a scene [m]."""
+    """Keypoints of a named object, scaled to the size that it has in a scene [m]."""
     means = make_object(name).means * OBJECTS[name].scale
     with single_threaded():
         return means[farthest_points(means, n)]
 
 
 def pile(lower, upper):
-    """One object above the floor and another one above it, slightly offset: (2, n, 3) [m]."""
+    """One object above the floor and a second one above it, slightly offset; points (2, n, 3) [m]."""
     lower = lower + torch.tensor([0.0, 0.0, -0.9 - float(lower[:, 2].min())])
     upper = upper + torch.tensor([0.05, 0.03, float(lower[:, 2].max()) + 0.15 - float(upper[:, 2].min())])
     return torch.stack([lower, upper])
@@ -49,7 +49,7 @@ def motion(initial, points):
 
 
 def assert_comes_to_rest(com, speed):
-    assert speed[:, :40].amax() > 0.8  # falls initially
+    assert speed[:, :40].amax() > 0.8  # it falls initially
     # 1/40 of that, averaged over the last second
     assert float(speed[:, -50:].mean(1).max()) < 0.02
     assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and moved by less than 0.05 m in 5 s
@@ -101,7 +101,8 @@ def test_unseen_shapes_come_to_rest(dropped):
     assert_comes_to_rest(*motion(*dropped))
 
 
-ALL = tuple(name for name in OBJECTS if name not in ("ball", "cloth"))  # the ball rolls; the cloth may creep
+# without the ball, which rolls, and the cloth, which may creep
+ALL = tuple(name for name in OBJECTS if name not in ("ball", "cloth"))
 
 
 @pytest.mark.slow

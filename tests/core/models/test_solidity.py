@@ -29,7 +29,7 @@ def test_solidity_grows_with_the_cube_of_the_thickness():
 
 
 def encoded(E, solidity):
-    """Stiffness passed to the network [Pa], compliance scale, and mass / size [kg/m]."""
+    """Stiffness passed to the network [Pa], compliance scale, and mass / size [kg/m] of an encoded body."""
     points = 0.3 * torch.randn(1, 1, 60, 3, generator=torch.Generator().manual_seed(0))
     initial = InitialConditions.of(points, E=torch.tensor(E), solidity=torch.tensor(solidity))
     model, calls = ForceField(16), []
@@ -71,12 +71,12 @@ def dropped(solidity, method="step", E=3e4, frames=40):
 
 
 def test_solid_ball_deforms_on_landing_and_recovers():
-    """Reference: MPM with 0.0133 m particle spacing: 14 % maximum compression, 0 % afterwards."""
+    """The reference is MPM with 0.0133 m particle spacing: 14 % maximum compression, 0 % afterwards."""
     solid, hollow = dropped(38.0), dropped(1.0)
     assert 0.75 < solid.min() < 0.95 and solid[30:35].min() > 0.98
     assert hollow[30:35].max() < 0.9
 
 
 def test_springs_of_very_stiff_solid_bodies_are_stable_with_explicit_steps():
-    height = dropped(1e3, "rk4", E=1e10, frames=25)  # it lands in the 13th
+    height = dropped(1e3, "rk4", E=1e10, frames=25)  # it lands in the 13th frame
     assert height.isfinite().all() and (height - 1).abs().max() < 0.1

@@ -1,4 +1,4 @@
-"""Cameras, rays and Gaussian maps against independent formulas and projections."""
+"""Cameras, rays and Gaussian maps of DiffSplat, compared with independent formulas and projections."""
 
 import math
 

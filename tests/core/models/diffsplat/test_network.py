@@ -1,4 +1,4 @@
-"""Components of the sampler against explicit formulas, and the whole with an oracle network."""
+"""DiffSplat's sampler: components compared with explicit formulas, and all of it with a network of known output."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ LATENT = SIDE // 2
 
 @torch.no_grad()
 def test_shared_attention_is_softmax_over_the_tokens_of_all_views():
-    """Against Vaswani et al. 2017, equation 1, in 64 bit, with the layer's own matrices."""
+    """The reference is Vaswani et al. 2017, equation 1, in 64 bit, with the layer's own matrices."""
     network, views = unet(), 3
     share_attention(network, views)
     layer = network.down_blocks[0].attentions[0].transformer_blocks[0].attn1.double()
@@ -42,7 +42,7 @@ def test_attention_is_shared_between_views_and_not_between_objects():
     after = network(x, 500, text).sample
     assert (after[0] - before[0]).abs().max() > 1e-4
     assert torch.equal(after[2:], before[2:])
-    swapped = network(x[[1, 0, 2, 3]], 500, text[[1, 0, 2, 3]]).sample  # views are distinguished by their rays only
+    swapped = network(x[[1, 0, 2, 3]], 500, text[[1, 0, 2, 3]]).sample  # views are distinguished only by their rays
     torch.testing.assert_close(swapped[[1, 0, 2, 3]], after, rtol=0, atol=1e-5)
 
 
@@ -121,7 +121,7 @@ def test_sampling_with_an_oracle_reaches_its_target(model, device):
 
 
 def check_network_inputs(model, image, views, text):
-    """Unconditional inputs (no image, negative prompt), then conditional ones; rays and flags in both."""
+    """The batch holds unconditional inputs (no image, negative prompt), then conditional ones, with rays and flags."""
     views, text = views.unflatten(0, (2, VIEWS + 1)), text.unflatten(0, (2, VIEWS + 1))
     latent = model.vae.encode(2 * image.permute(2, 0, 1)[None] - 1).latent_dist.mode()[0]
     assert not views[0, 0, :4].any()

@@ -1,4 +1,4 @@
-"""Published weights: layout, names and sizes, error messages, and download."""
+"""Published weights of DiffSplat: layout, names and sizes, error messages, and download."""
 
 import json
 import logging

@@ -14,9 +14,9 @@ from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET
 if TYPE_CHECKING:
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
-SIDE = 32  # of the images [px]; latents have half of it
+SIDE = 32  # side of the images [px]; latents have half of it
 WIDTHS = (8, 16)
-SCHEDULER = {  # that of Stable Diffusion 1.5
+SCHEDULER = {  # the scheduler of Stable Diffusion 1.5
     "_class_name": "PNDMScheduler", "beta_end": 0.012, "beta_schedule": "scaled_linear", "beta_start": 0.00085,
     "num_train_timesteps": 1000, "set_alpha_to_one": False, "skip_prk_steps": True, "steps_offset": 1,
     "trained_betas": None, "clip_sample": False,

@@ -1,4 +1,4 @@
-"""The single step of OSEDiff, against the public code's procedure with unmerged updates."""
+"""The single step of OSEDiff, compared with the published code's procedure with unmerged updates."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ ADAPTERS = ("encoder", "decoder", "others")
 
 
 def add_updates(network, state, rank):
-    """Run the updates beside their layers, as peft does: y + (alpha / rank) B(A(x)), alpha 8 by default."""
+    """Apply the updates beside their layers, as peft does: y + (alpha / rank) B(A(x)); alpha is 8 by default."""
 
     def hook(layer, inputs, output, down, up):
         if isinstance(layer, torch.nn.Conv2d):
@@ -30,7 +30,7 @@ def add_updates(network, state, rank):
 
 @torch.no_grad()
 def public_procedure(model, image, prompt, seed, updated=True):
-    """Without colours: encode, one step of DDPM from t = 999 to the end, decode; for sizes that are multiples of 8."""
+    """Encode, apply one step of DDPM from t = 999 to the end, decode; without colours, for sizes divisible by 8."""
     from diffusers import DDPMScheduler
 
     lora, vae, network = lora_file(), autoencoder().eval(), unet().eval()
@@ -51,7 +51,7 @@ def public_procedure(model, image, prompt, seed, updated=True):
 
 
 def adain(image, source):
-    """Each channel with the mean and standard deviation of the source, in 64 bit."""
+    """Give each channel of an image the mean and standard deviation of the source, in 64 bit."""
     image, source = image.double().numpy(), source.double().numpy()
     deviation = [(x.var((0, 1), ddof=1) + 1e-5) ** 0.5 for x in (image, source)]
     out = (image - image.mean((0, 1))) / deviation[0] * deviation[1] + source.mean((0, 1))
@@ -70,11 +70,11 @@ def test_output_equals_the_public_procedure(folder, image):
     expected = public_procedure(model, image, "a duck", 7)
     torch.testing.assert_close(actual, adain(expected, image), rtol=0, atol=2e-4)
     plain = public_procedure(model, image, "a duck", 7, updated=False)
-    assert (adain(plain, image) - actual).abs().mean() > 100 * 2e-4  # what the updates change
+    assert (adain(plain, image) - actual).abs().mean() > 100 * 2e-4  # the updates have an effect
 
 
 def test_signal_at_the_last_step_is_that_of_stable_diffusion(model):
-    """Rombach et al. 2022: the roots of the betas are evenly spaced from 0.00085 to 0.012."""
+    """In Rombach et al. 2022 the square roots of the betas are evenly spaced from 0.00085 to 0.012."""
     betas = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2
     assert model.signal == pytest.approx(float((1 - betas).prod()), rel=1e-4)
 
@@ -108,7 +108,8 @@ def test_colours_keep_mean_and_standard_deviation():
     small, other = image[0, :, :3, :4], source[0, :, :3, :4].clamp(0, 1)
     expected = adain(small.permute(1, 2, 0), other.permute(1, 2, 0)).permute(2, 0, 1)
     torch.testing.assert_close(match_colours(small[None], other[None])[0], expected)
-    assert match_colours(image, torch.ones_like(image)).amin() > 0.98  # white stays white but for the 1e-5
+    # white stays white up to the regularisation by 1e-5
+    assert match_colours(image, torch.ones_like(image)).amin() > 0.98
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ def lora() -> dict:
 
 
 def check_refused(lora, path, match):
-    """The file is read, or merged into the U-Net, with an error that names it."""
+    """Reading the file, or merging it into the U-Net, raises an error that names it."""
     torch.save(lora, path)
     with pytest.raises(InputError, match=match) as caught:
         merge_lora(unet().requires_grad_(False), read_lora(path), "unet", path)
@@ -94,7 +94,8 @@ def test_another_base_is_refused(folder, tmp_path):
     files = find(shutil.copytree(folder, tmp_path / "copy"))
     scheduler = files.base / "scheduler/scheduler_config.json"
     config = json.loads(scheduler.read_text())
-    scheduler.write_text(json.dumps({**config, "prediction_type": "v_prediction"}))  # Stable Diffusion 2.1 for 768
+    # the prediction type of Stable Diffusion 2.1 for 768 px
+    scheduler.write_text(json.dumps({**config, "prediction_type": "v_prediction"}))
     with pytest.raises(InputError, match="as Stable Diffusion 2.1 base .*v_prediction and not noise"):
         load(files)
     scheduler.write_text(json.dumps(config))
@@ -110,7 +111,7 @@ def test_missing_package_is_reported(folder, monkeypatch):
 
 
 def test_size_that_is_stated_is_that_of_the_published_base():
-    """Sizes of its configurations: 865,910,724 parameters of the U-Net; text encoder and autoencoder as published."""
+    """Computed from its configurations: 865,910,724 U-Net parameters; text encoder and autoencoder as published."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel
 

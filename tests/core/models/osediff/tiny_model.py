@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from torch import nn
 
-RANK = 4  # of the published training command
+RANK = 4  # rank of the updates, as in the published training command
 UNET_PARTS = ("to_k", "to_q", "to_v", "to_out.0", "conv", "proj_out", "proj_in", "ff.net.2", "ff.net.0.proj")
 VAE_PARTS = ("conv", "to_k", "to_q", "to_v", "to_out.0")
 
@@ -26,12 +26,12 @@ def unet() -> UNet2DConditionModel:
 
 
 def autoencoder() -> AutoencoderKL:
-    """An autoencoder that reduces images by 8, as the published one."""
+    """An autoencoder that reduces image sides to 1/8, as the published one."""
     return tiny_model.autoencoder(3, (8, 8, 8, 16))
 
 
 def lora_file(rank: int = RANK) -> dict:
-    """Random updates of all layers that the public code updates, with its entries and names."""
+    """Random updates of all layers that the published code updates, with its entries and names."""
     networks, rng = {"unet": unet(), "vae": autoencoder()}, torch.Generator().manual_seed(5)
     names = [n.removesuffix(".weight") for n, _ in networks["unet"].named_parameters() if "bias" not in n]
     names = [n for n in names if "norm" not in n and any(part in n for part in UNET_PARTS)]
@@ -40,7 +40,7 @@ def lora_file(rank: int = RANK) -> dict:
     others = [n for n in names if n not in encoder and n not in decoder]
     images = [n.removesuffix(".weight") for n, _ in networks["vae"].named_parameters() if "bias" not in n]
     images = [n for n in images if "norm" not in n and n.startswith("encoder.") and any(p in n for p in VAE_PARTS)]
-    images = [*images, "quant_conv", *images]  # the public code lists most of them several times
+    images = [*images, "quant_conv", *images]  # the published code lists most of them several times
     state = {network: {} for network in networks}
     adapters = (("unet", "encoder", encoder), ("unet", "decoder", decoder), ("unet", "others", others),
                 ("vae", "encoder", images))  # fmt: skip
@@ -67,7 +67,7 @@ def save_network(network: nn.Module, folder: Path) -> None:
 
 
 def save_tiny_osediff(folder: Path) -> Path:
-    """Write the parts into osediff/ of a folder."""
+    """Write all parts of the model into osediff/ of a folder."""
     base = folder / "osediff" / BASE
     tiny_model.save_stable_diffusion(base, autoencoder())
     save_network(unet(), base / "unet")

@@ -1,4 +1,4 @@
-"""Memory estimate against the measured peak."""
+"""π³: estimate of the memory, compared with the measured peak."""
 
 import dataclasses
 import weakref

@@ -1,4 +1,4 @@
-"""π³: components against recorded outputs of the published code, state dict names, and invariances."""
+"""π³: components compared with recorded outputs of the published code, names in the state dict, and invariances."""
 
 import pytest
 import torch

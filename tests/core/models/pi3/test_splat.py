@@ -1,4 +1,4 @@
-"""Pi3-splat: components and Gaussians against recorded outputs of the published code."""
+"""Pi3-splat: components and Gaussians, compared with recorded outputs of the published code."""
 
 import dataclasses
 

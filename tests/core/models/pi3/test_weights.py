@@ -1,4 +1,4 @@
-"""Published weights: search, loading from both file formats, error messages and download."""
+"""Published weights of π³: search, loading from both file formats, error messages and download."""
 
 import logging
 import math

@@ -8,7 +8,7 @@ from tests.core.models.sam2.tiny_model import SIDE, random_model
 
 @pytest.fixture(scope="module")
 def generation():
-    """The module, which imports transformers' models: that takes a second."""
+    """The tested module; importing it takes a second, because it imports transformers' models."""
     from stages.core.models.sam2 import mask_generation
 
     return mask_generation
@@ -41,7 +41,7 @@ def test_masks_equal_those_of_the_image_model(generation):
 
 
 def test_stability_of_known_logits(generation):
-    row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # above 1: two; above -1: five
+    row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # two are above 1, five above -1
     soft, hard = row[None], torch.tensor([[[-9.0, -9, 9, 9, 9, 9]]])
     torch.testing.assert_close(
         generation.mask_stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0])
@@ -51,8 +51,8 @@ def test_stability_of_known_logits(generation):
 def test_duplicate_with_the_lower_score_is_removed(generation):
     masks = torch.zeros(5, 1, 20, dtype=torch.bool)
     masks[0, 0, :10] = True
-    masks[1, 0, 1:11] = True  # 9 of 11 shared with the first: 0.82
-    masks[2, 0, :5] = True  # a part of the first: 0.5
+    masks[1, 0, 1:11] = True  # 9 of the 11 pixels in its union with the first mask are shared: IoU 0.82
+    masks[2, 0, :5] = True  # a part of the first mask, with an IoU of 0.5
     masks[3, 0, 12:] = True
     scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # the fifth mask is empty
     assert generation.suppress_duplicates(masks, scores, 0.7).tolist() == [2, 1, 3]

@@ -13,7 +13,7 @@ BOX, POINT = torch.tensor([0.1, 0.1, 0.5, 0.6]), torch.tensor([0.7, 0.4])
 
 @pytest.fixture(scope="module")
 def network():
-    """The module, which subclasses a class of transformers: importing it takes a second."""
+    """The tested module; importing it takes a second, because it subclasses a class of transformers."""
     from stages.core.models.sam2 import network
 
     return network
@@ -30,7 +30,7 @@ def video():
 
 
 def reference_masks(model, video, add_prompts) -> dict[int, torch.Tensor]:
-    """Reference masks: all frames and outputs in memory, by the iterators of transformers."""
+    """Reference masks by the iterators of transformers, with all frames and outputs in memory."""
     from transformers import Sam2VideoInferenceSession
 
     session = Sam2VideoInferenceSession(video=video, dtype=torch.float32)

@@ -1,4 +1,4 @@
-"""Weights of SAM 2.1: search, checks, download."""
+"""Weights of SAM 2.1: search, checks and download."""
 
 import json
 import logging

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import torch
 
-SIDE = 128  # of the input images [px]
-WIDTH = 128  # of the tokens; the published 256 also splits object pointers into pieces of 64
+SIDE = 128  # side of the input images [px]
+WIDTH = 128  # dimension of the tokens; the published 256 would also split object pointers into pieces of 64
 
 
 def config(**changes):
-    """Configuration of the tiny model with `changes`."""
+    """Configuration of the tiny model with `changes` applied."""
     from transformers import Sam2VideoConfig
     from transformers.models.sam2_video.configuration_sam2_video import Sam2VideoMaskDecoderConfig
 

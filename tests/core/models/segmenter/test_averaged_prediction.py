@@ -1,4 +1,4 @@
-"""Predictions averaged over turned and mirrored copies of a scene."""
+"""Predictions averaged over rotated and mirrored copies of a scene."""
 
 import itertools
 
@@ -13,11 +13,11 @@ from stages.core.models.segmenter.voxels import LAB, ScenePoints, voxelise
 
 
 class _Vectors(Segmenter):
-    """Says normals for offsets, colours for classes, and the number of the call for the embedding."""
+    """Network stub that returns normals as offsets, colours as classes, and the number of its call as embedding."""
 
     def __init__(self):
         super().__init__((4,))
-        self.calls = itertools.count()  # by several threads
+        self.calls = itertools.count()  # next() on it is safe from several threads
 
     def forward(self, features, levels) -> Prediction:
         """Predictions for the voxels."""
@@ -25,7 +25,7 @@ class _Vectors(Segmenter):
         return Prediction(features[:, LAB], features[:, 3:6], call)
 
 
-QUARTER = ((0, -1, 0), (1, 0, 0), (0, 0, 1))  # unlike TURNS not its own inverse
+QUARTER = ((0, -1, 0), (1, 0, 0), (0, 0, 1))  # unlike the rotations in TURNS, it is not its own inverse
 
 
 @pytest.mark.parametrize("turn", [None, QUARTER])
@@ -36,7 +36,7 @@ def test_offsets_are_turned_back_and_all_copies_count_alike(turn, monkeypatch):
     grid, model = voxelise(surfels), _Vectors()
     levels, found = averaged_prediction(surfels, grid, model)
     assert next(model.calls) == COPIES == 4 and len(levels) == 1
-    assert_close(found.embedding, torch.full_like(found.embedding, 1.5))  # the mean of 0 to 3
+    assert_close(found.embedding, torch.full_like(found.embedding, 1.5))  # the mean of the call numbers 0 to 3
     outward = torch.nn.functional.normalize(grid.points, dim=1)
     turned = torch.nn.functional.normalize(found.offsets, dim=1)
     assert float((turned * outward).sum(1).min()) > 0.98
@@ -44,7 +44,7 @@ def test_offsets_are_turned_back_and_all_copies_count_alike(turn, monkeypatch):
 
 
 def ball() -> ScenePoints:
-    """Points of a ball with outward normals, red above and blue below."""
+    """Points of a ball with outward normals, red in the upper half and blue in the lower half."""
     up = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
     up = torch.nn.functional.normalize(up, dim=1)
     lab = torch.where(up[:, 2:] > 0, torch.tensor([50.0, 60, 40]), torch.tensor([40.0, 10, -50]))

@@ -1,4 +1,4 @@
-"""Links between voxels of one object."""
+"""Candidate objects: links between voxels, and the tree of merges."""
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ def test_only_the_given_voxels_are_linked():
 
 
 def test_leaves_are_connected_voxels_of_one_coarse_cell(device):
-    """With affinities that are certain, leaves are the cells of twice the side, and sums count every voxel once."""
+    """With certain affinities, leaves are the cells of twice the voxel side, and sums count every voxel once."""
     torch.manual_seed(0)
     cells = torch.cartesian_prod(*[torch.arange(4)] * 3).to(device)
     points = VOXEL * (cells + 0.5)
@@ -44,6 +44,6 @@ def test_leaves_are_connected_voxels_of_one_coarse_cell(device):
     assert candidates.tree.count == 8
     assert len({(tuple(c), int(k)) for c, k in zip((cells // 2).tolist(), candidates.leaf, strict=True)}) == 8
     np.testing.assert_allclose(candidates.sizes[: candidates.tree.count], 8, rtol=1e-5)
-    total = candidates.sums(points.cpu())[-1]  # the root
+    total = candidates.sums(points.cpu())[-1]  # the last row is the root
     np.testing.assert_allclose(total, points.double().sum(0).cpu(), rtol=1e-6)
     np.testing.assert_allclose(candidates.extents[-1], 4 * VOXEL, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Objects of the reduced scene are kept where the scene at its own scale expects them too."""
+"""Objects found in the reduced scene are kept if the scene at its own scale contains them too."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from stages.core.models.segmenter.merge_tree import MergeTree
 from stages.core.models.segmenter.network import CANDIDATE_FEATURES
 from stages.core.models.segmenter.segment import OBJECT_COST, ScoredCandidates, Segmentation, confirmed
 
-OWNER = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3, -1])  # voxel of each surfel
+OWNER = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3, -1])  # voxel of each surfel, -1 for none
 
 
 def scored(ious: list[float]) -> ScoredCandidates:
-    """Four voxels that merge in pairs: nodes 4 (0, 1), 5 (2, 3) and 6, of all."""
+    """Candidates of four voxels that merge in pairs: nodes 4 (voxels 0, 1), 5 (voxels 2, 3) and 6 (all)."""
     tree = MergeTree(4, np.array([[0, 1], [2, 3], [4, 5]]), np.zeros(3), np.ones(3))
     candidates = Candidates(torch.arange(4), torch.arange(4), tree, torch.zeros(7, CANDIDATE_FEATURES))
     return ScoredCandidates(candidates, torch.tensor(ious), torch.ones(7), 1.0, OWNER, torch.zeros(len(OWNER), 3))
@@ -28,7 +28,7 @@ def reduced(labels: list[int], iou: float) -> Segmentation:
 def test_the_candidate_that_covers_an_object_says_what_to_expect():
     found = scored([0.1] * 4 + [0.9, 0.8, 0.5])
     objects = reduced([0, 0, 0, 0, 1, 1, -1, -1, 1], 0.9)
-    # the second object shares two of its three surfels with node 2 and with the four of node 5
+    # the second object shares two of its three surfels with node 2, and the same two with the four surfels of node 5
     np.testing.assert_allclose(found.expected_ious(objects), [0.9, max(0.1 * 2 / 3, 0.8 * 2 / 5)], rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Trees of merges by average linkage, and the choice of nodes."""
+"""Merge trees by average linkage, and the selection of nodes."""
 
 import itertools
 

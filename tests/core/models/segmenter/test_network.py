@@ -1,4 +1,4 @@
-"""The sparse network: convolutions as dense ones, symmetric affinities."""
+"""The sparse network: its convolutions equal dense ones, and its affinities are symmetric."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from stages.core.models.segmenter.voxels import FEATURES, neighbour_table
 
 
 def some_cells(seed: int = 0) -> torch.Tensor:
-    """Half of the cells of a 6 x 5 x 4 block, in random order, some coordinates negative."""
+    """Half of the cells of a 6 x 5 x 4 block, in random order, with some negative coordinates."""
     generator = torch.Generator().manual_seed(seed)
     cells = torch.cartesian_prod(torch.arange(6), torch.arange(5), torch.arange(4)) - 2
     return cells[torch.randperm(len(cells), generator=generator)[: len(cells) // 2]]
@@ -21,7 +21,8 @@ def test_a_convolution_is_that_of_a_dense_grid_with_zeros_elsewhere(device, bloc
     cells = some_cells().to(device)
     x = torch.randn(len(cells), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     x = x.to(device).requires_grad_()
-    layer = Convolution(3, 4).to(device, torch.float64)  # cuDNN's products of float32 have the precision of TF32
+    # cuDNN would compute products of float32 with the precision of TF32
+    layer = Convolution(3, 4).to(device, torch.float64)
     level = pyramid(cells, 1)[0]
     found = layer(x, level)
 
@@ -49,7 +50,7 @@ def test_neighbours_are_mutual():
 
 @torch.no_grad()
 def test_outputs_move_with_the_voxels_and_affinities_are_symmetric():
-    """A shift by the coarsest voxel changes nothing; a pair may be given in either order."""
+    """A shift by one coarsest voxel changes nothing, and the order within a pair does not matter."""
     torch.manual_seed(0)
     model, cells = Segmenter((8, 12, 16)), some_cells()
     features = torch.randn(len(cells), FEATURES)
@@ -69,7 +70,7 @@ def test_products_in_16_bits_are_close():
         low = layer(x, level)
     assert low.dtype == x.dtype
     error = float((low - layer(x, level)).detach().abs().max())
-    assert 0 < error < 0.1  # 0: the context was ignored
+    assert 0 < error < 0.1  # the error would be 0 if the context were ignored
 
 
 @pytest.mark.parametrize("levels", [1, 4])

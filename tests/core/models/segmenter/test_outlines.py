@@ -1,4 +1,4 @@
-"""Outlines finer than voxels."""
+"""Outlines of labels that are finer than voxels."""
 
 import torch
 
@@ -7,7 +7,7 @@ from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, voxelise
 
 
 def plate(edge: float) -> ScenePoints:
-    """A level plate, red where x is below `edge` and blue beyond."""
+    """A horizontal plate, red where x is below `edge` and blue elsewhere."""
     line = torch.arange(-0.1, 0.1, VOXEL / 4) + 1e-4
     points = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1), value=0.003)
     n = len(points)
@@ -17,7 +17,7 @@ def plate(edge: float) -> ScenePoints:
 
 
 def test_an_outline_follows_the_edge_of_colour_within_a_voxel():
-    """The labels of voxels end at 0, the colour at 0.004 beyond."""
+    """Voxel labels change at x = 0, the colour at x = 0.004."""
     edge = 0.4 * VOXEL
     surfels = plate(edge)
     grid = voxelise(surfels)

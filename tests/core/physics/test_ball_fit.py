@@ -1,4 +1,4 @@
-"""Balls recognised by their surface: noise, what photos do not show, and shapes that are nearly round."""
+"""Balls recognised by their surface, with noise, missing parts, and shapes that are nearly round."""
 
 import numpy as np
 import pytest
@@ -13,13 +13,13 @@ NO_FLOOR = -np.inf
 
 
 def polyhedron(normals: np.ndarray) -> np.ndarray:
-    """Points on the polyhedron whose faces are tangent to the unit ball at the directions of some vectors (f, 3)."""
+    """Points on the polyhedron whose faces are tangent to the unit ball at the directions of vectors (f, 3)."""
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return UNIT / (UNIT @ normals.T).max(1)[:, None]
 
 
 def signs(*rows: tuple) -> np.ndarray:
-    """Vectors with all signs, and with their coordinates turned round."""
+    """All cyclic permutations of vectors' coordinates with all combinations of signs."""
     every = np.concatenate([np.array(rows) * s for s in np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)])
     return np.concatenate([np.roll(every, k, 1) for k in range(3)])
 
@@ -51,7 +51,7 @@ OTHERS = {
 @pytest.mark.parametrize("all_seen", [True, False])
 @pytest.mark.parametrize("turn", [0, 1])
 def test_other_shapes_are_not_balls(name, all_seen, turn):
-    """Standing on a floor or, turned at random, seen from all sides."""
+    """The shapes stand on a floor or are randomly rotated, and are partly or completely visible."""
     points = OTHERS[name]
     if turn:
         points = Rotation.random(random_state=3).apply(points)
@@ -61,7 +61,7 @@ def test_other_shapes_are_not_balls(name, all_seen, turn):
 
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 def test_centre_and_radius_from_uneven_noisy_points(noise):
-    """One side has three times as many points, and a tuft stands out by up to .3 radii."""
+    """One side has three times as many points as the other, and a tuft protrudes by up to 0.3 radii."""
     rng = np.random.default_rng(0)
     points = np.concatenate([UNIT, UNIT[UNIT[:, 0] > 0], UNIT[UNIT[:, 0] > 0]])
     points = points * (1 + noise * rng.standard_normal((len(points), 1)))
@@ -72,7 +72,7 @@ def test_centre_and_radius_from_uneven_noisy_points(noise):
 
 
 def skirted(depth: float) -> np.ndarray:
-    """The hull of a ball and its shadow on the floor at z = 0, which is at this depth below its equator."""
+    """The convex hull of a ball and its shadow on the floor z = 0, which is `depth` below the ball's centre."""
     upper, below = UNIT[UNIT[:, 2] > -0.5], UNIT[UNIT[:, 2] <= -0.5]
     ring = below * np.minimum(1 / np.linalg.norm(below[:, :2], axis=1), -depth / below[:, 2])[:, None]
     return np.concatenate([upper, ring]) + [0, 0, depth]
@@ -86,7 +86,7 @@ def test_a_skirt_where_a_ball_rests_is_no_part_of_it_in_photos():
 
 @pytest.mark.parametrize(("depth", "floor", "is_ball"), [(0.95, 0.0, True), (0.8, 0.0, False), (0.8, NO_FLOOR, True)])
 def test_a_ball_whose_flat_face_is_on_the_floor_is_a_dome(depth, floor, is_ball):
-    """The ball would be sunk in by what is missing; in the air the face may be where no photo looked."""
+    """On the floor, a ball would penetrate by the missing part; in the air, that part may just not have been seen."""
     dome = np.column_stack([UNIT[:, :2], np.maximum(UNIT[:, 2], -depth)]) + [0, 0, depth + 1e-3]
     assert (fitted_ball(dome, floor, all_seen=False) is not None) == is_ball
 
@@ -101,7 +101,7 @@ def test_a_ball_on_a_foot_is_not_a_ball(height, is_ball):
 def test_a_surface_that_is_open_or_empty_has_no_ball():
     assert fitted_ball(np.empty((0, 3)), 0.0, all_seen=False) is None
     assert fitted_ball(UNIT[np.abs(UNIT[:, 0]) < 0.6], NO_FLOOR, all_seen=False) is None
-    assert fitted_ball(UNIT + [0, 0, 1], 3.0, all_seen=False) is None  # all of it below the floor
+    assert fitted_ball(UNIT + [0, 0, 1], 3.0, all_seen=False) is None  # all points are below the floor
 
 
 def test_a_ball_is_clear_of_points_up_to_a_tenth_of_its_radius_inside():

@@ -20,7 +20,7 @@ SIDES = np.array([0.4, 0.3, 0.2])
 
 
 def sampled(surface) -> tuple:
-    """The shape of a body of about 3,000 particles, and their spacing."""
+    """Shape of a body of about 3,000 particles, and the spacing of these [m]."""
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
     scene = Scene(g, (SceneObject(1, "body"),), None, None)
     bodies = surface_particles(scene, sample_bodies(scene, 3000, skin=True))
@@ -62,7 +62,7 @@ def test_without_a_surface_the_faces_of_voxels_bound_the_body():
 
 
 def test_the_surface_does_not_depend_on_where_an_object_is():
-    """Voxels begin at the object's bounds: moved by any part of a voxel, depths at its points are the same."""
+    """Voxels begin at the object's bounds, so depths at its points stay equal if it moves by a fraction of a voxel."""
     depths = []
     x = np.random.default_rng(0).uniform(-0.25, 0.25, (3000, 3))
     for offset in ((0.0, 0.0, 0.0), (0.0031, 0.0, -0.0017), (0.7, -1.3, 0.0043)):
@@ -78,11 +78,12 @@ def test_the_surface_does_not_depend_on_where_an_object_is():
 
 @pytest.mark.parametrize("spacing", [0.006, 0.012])
 def test_planes_at_edges_are_those_of_one_face(spacing):
-    """A rod with a square section, four to eight spacings across, whose edges are between the samples."""
+    """A rod with a square section of four to eight point spacings, whose edges lie between the points."""
     surface = box((0.3, 0.05, 0.05), spacing).moved((0.0031, -0.0017, 0.4))
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
     solid = solid_surface(Scene(g, (SceneObject(1, "rod"),), None, None), 1)
     volume = solid.fitted.body_voxels()[2].sum() * solid.h**3
-    assert volume == pytest.approx(0.3 * 0.05**2, rel=0.1)  # filled, although voxels are smaller than the spacing
+    # it is filled although voxels are smaller than the point spacing
+    assert volume == pytest.approx(0.3 * 0.05**2, rel=0.1)
     straight = [(np.abs(part.normals).max(1) > 0.999).mean() for part in (solid, solid.fitted)]
     assert straight[0] < 0.5 and straight[1] > 0.9

@@ -17,7 +17,7 @@ PLANE = (0.0, 0.0, 0.0)
 
 
 def tilted(slope: float) -> tuple[float, float, float, float]:
-    """Rotation of z to the normal of a plane that falls along x with this slope."""
+    """Rotation (x, y, z, w) of the z axis to the normal of a plane that falls along x with this slope."""
     half = math.atan(slope) / 2
     return math.cos(half), 0.0, math.sin(half), 0.0
 
@@ -78,7 +78,7 @@ def dropped(restitution: float, finer: int, collider: bool) -> float:
 @pytest.mark.parametrize("collider", [True, False])
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 def test_restitution_does_not_depend_on_the_substep(restitution, collider):
-    # a sheet has no internal waves, so the speed returned is that of the surface
+    # a sheet has no internal waves, so its speed is that of its surface
     for finer in (1, 4):
         assert dropped(restitution, finer, collider) == pytest.approx(restitution, abs=0.05)
 
@@ -89,7 +89,7 @@ def test_a_block_rests_on_a_box_and_falls_past_its_edge():
     solver = mpm.Solver(mpm.join_particles([on, beside]), FREE, 0.05, options=mpm.SolverOptions((table,)))
     roll(solver, 0.3, (0.0, 0.0, -9.81))
     z = solver.particles.x[:, 2]
-    assert abs(float(z[: len(on)].min()) - 0.3) < 0.05  # a cell
+    assert abs(float(z[: len(on)].min()) - 0.3) < 0.05  # the tolerance is one cell
     assert float((beside.x[:, 2] - z[len(on) :]).mean()) == pytest.approx(9.81 * 0.3**2 / 2, rel=0.02)
 
 
@@ -111,7 +111,7 @@ def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, schedule):
     roll(solver, 0.6)
     assert solver.colliders[0].centre == pytest.approx((0.1, 0.1, 0.1))
     now = solver.particles
-    # the body has the speed of the wall or bounces ahead
+    # the body moves with the wall or bounces ahead of it
     assert 0.45 < float(now.v[:, 0].mean()) < 1.0 and float(now.x[:, 0].min()) > 0.25 - 0.05
     table = Collider("box", PLANE, (0.5, 0.5, 0.15), angular_velocity=(0.0, 0.0, 1.0), surface="sticky")
     solver = mpm.Solver(block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=50.0, low=(0.2, -0.05, 0.13)), FREE, 0.05,
@@ -142,7 +142,7 @@ def test_prescribed_motion_of_colliders():
 
 
 def test_colliders_turn_about_an_axis_of_the_world():
-    """By 1.2 rad about (1, 2, 2) / 3, from any rotation, in one step or in many."""
+    """Rotation by 1.2 rad about (1, 2, 2) / 3, from any initial rotation, in one step or in many."""
     start, rate = (0.8, -0.36, 0.48, 0.0), (0.4, 0.8, 0.8)
     once = Collider("box", PLANE, (1, 1, 1), rotation=start, angular_velocity=rate).advanced(1.0)
     turn = torch.tensor([math.cos(0.6), *(math.sin(0.6) * v / 1.2 for v in rate)])
@@ -168,4 +168,4 @@ def test_rotations_of_colliders_need_not_have_length_1():
     longer, unit = (as_obstacles([Collider("box", PLANE, (1, 1, 1), rotation=r)], "cpu").numpy()
                     for r in ((0.0, 3.0, 0.0, 4.0), (0.0, 0.6, 0.0, 0.8)))  # fmt: skip
     np.testing.assert_allclose(longer["turn"], unit["turn"])
-    np.testing.assert_allclose(unit["turn"][0], [0.6, 0.0, 0.8, 0.0])  # x y z w
+    np.testing.assert_allclose(unit["turn"][0], [0.6, 0.0, 0.8, 0.0])  # order x, y, z, w

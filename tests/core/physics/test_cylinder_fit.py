@@ -1,4 +1,4 @@
-"""Cylinders recognised by their surface, among shapes that are nearly cylinders; Gaussians at random."""
+"""Cylinders recognised by their surface, compared with nearly cylindrical shapes; Gaussians at random points."""
 
 import math
 
@@ -18,7 +18,7 @@ CENTRE = np.array([1.0, -2.0, 3.0])
 
 
 def lathe(*profile: tuple[float, float], n: int = 4000) -> np.ndarray:
-    """Points (n, 3) at random on a surface of revolution about z, of an outline of (radius, height)."""
+    """Random points (n, 3) on a surface of revolution about z with an outline of (radius, height) points."""
     rng = np.random.default_rng(0)
     p = np.array(profile)
     step = np.diff(p, axis=0)
@@ -26,18 +26,18 @@ def lathe(*profile: tuple[float, float], n: int = 4000) -> np.ndarray:
     row = rng.choice(len(step), 4 * n, p=area / area.sum())
     at = p[row] + rng.random((4 * n, 1)) * step[row]
     widest = np.maximum(p[row, 0], p[row + 1, 0])
-    at = at[rng.random(4 * n) * widest < at[:, 0]][:n]  # fewer where it is narrow
+    at = at[rng.random(4 * n) * widest < at[:, 0]][:n]  # fewer points where the radius is small
     turn = rng.uniform(0, 2 * np.pi, len(at))
     return np.column_stack([at[:, 0] * np.cos(turn), at[:, 0] * np.sin(turn), at[:, 1]])
 
 
 def cylinder(height: float, n: int = 4000) -> np.ndarray:
-    """Of radius 1."""
+    """Points on a cylinder of radius 1 about z."""
     return lathe((0, -height / 2), (1, -height / 2), (1, height / 2), (0, height / 2), n=n)
 
 
 def prism(sides: int) -> np.ndarray:
-    """A prism around the cylinder of height 2."""
+    """Points on a regular prism that circumscribes the cylinder of height 2."""
     x = cylinder(2.0)
     turn = 2 * np.pi * np.arange(sides) / sides
     out = x[:, :2] / np.maximum(np.linalg.norm(x[:, :2], axis=1, keepdims=True), 1e-12)
@@ -52,7 +52,7 @@ def fit(points: np.ndarray) -> Cylinder | None:
 @pytest.mark.parametrize("height", [0.1, 1.0, 1.66, 3**0.5, 2.0, 3.0, 10.0])
 @pytest.mark.parametrize(("n", "noise"), [(1000, 0.0), (4000, 0.01)])
 def test_cylinders_of_all_heights(height, n, noise):
-    """Also where all directions are principal ones of the solid (the root of 3), its surface or its normals (2)."""
+    """Includes the heights for which the solid (√3), the surface or the normals (2) have no unique principal axes."""
     points = cylinder(height, n)
     found = fit(points + noise * min(height, 1.0) * np.random.default_rng(1).standard_normal(points.shape))
     np.testing.assert_allclose(found.centre, CENTRE, rtol=0, atol=4e-3)
@@ -84,7 +84,7 @@ def test_other_shapes_are_no_cylinders(name):
 
 
 def test_a_cylinder_has_its_moments_and_its_edges():
-    """m r^2 / 2 about the axis, m (r^2 / 4 + h^2 / 12) across."""
+    """The moments are m r^2 / 2 about the axis and m (r^2 / 4 + h^2 / 12) about a perpendicular one."""
     r, h = 0.1, 0.25
     points = torch.from_numpy(TURN.apply(r * cylinder(h / r))) + torch.tensor([0.0, 0.0, 2.0])
     shape = rigid_shapes(scene(splats(points, scale=0.002), floor=0.0))[0]

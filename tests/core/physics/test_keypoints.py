@@ -19,7 +19,7 @@ from tests.core.physics.test_particles import scene, splats
 
 
 def test_weights_of_neighbours_on_a_line():
-    """(1 - (d / r)^2)^2 with r the distance to the next neighbour after the k nearest."""
+    """Weights are (1 - (d / r)^2)^2; r is the distance of the next neighbour after the k nearest."""
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]])
     index, weight = nearest_weights(points, torch.zeros(1, 3), 2)
     raw = torch.tensor([1.0, (1 - 1 / 9) ** 2])
@@ -31,21 +31,21 @@ def test_weights_of_neighbours_on_a_line():
 
 
 def test_weights_of_fewer_points_than_neighbours():
-    """The radius is half as far again as the farthest of them, and the columns that are left have no weight."""
+    """The radius is 1.5 times the distance of the farthest point; the unused columns have zero weight."""
     points = torch.tensor([[0.0, 0, 0], [2, 0, 0]])
     index, weight = nearest_weights(points, torch.zeros(1, 3), 4)
     raw = torch.tensor([1.0, (1 - 4 / 9) ** 2, 0, 0])
     torch.testing.assert_close(weight, (raw / raw.sum())[None])
     assert index[0, :2].tolist() == [0, 1]
-    for one in (torch.zeros(1, 3), torch.ones(1, 3)):  # at its place and elsewhere
+    for one in (torch.zeros(1, 3), torch.ones(1, 3)):  # a query at the point and one elsewhere
         _, alone = nearest_weights(one, torch.zeros(3, 3), 4)
         assert alone.tolist() == [[1.0, 0, 0, 0]] * 3
     same = nearest_weights(torch.zeros(5, 3), torch.zeros(1, 3), 4)[1]
-    torch.testing.assert_close(same, torch.full((1, 4), 0.25))  # all at one place
+    torch.testing.assert_close(same, torch.full((1, 4), 0.25))  # all points coincide
 
 
 def test_rounding_does_not_choose_between_points_that_are_equally_far():
-    """On a lattice most distances are equal; moved and rescaled by what only rounds, the same points are taken."""
+    """On a lattice, most distances are equal; moving and scaling by rounding errors must give the same neighbours."""
     lattice = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
     chosen = farthest_points(lattice, 60)
     assert len(chosen.unique()) == 60
@@ -74,7 +74,7 @@ def test_objects_without_usable_gaussians_have_keypoints_where_these_are():
 
 
 def test_an_object_is_not_reduced_to_a_point():
-    """Of two Gaussians one would be an outlier, and of three here only one is usable."""
+    """With two Gaussians one would be an outlier; of the three here only one is usable."""
     pair = splats(torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
     three = splats(torch.tensor([[2.0, 0, 0], [3, 0, 0], [4, 0, 0]]))
     three = replace(three, opacities=torch.tensor([0.0, 0.9, 0.0]), object_id=torch.full((3,), 2))

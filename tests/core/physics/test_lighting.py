@@ -1,4 +1,4 @@
-"""The fit of the light to log colours: against colours that are made from known shadows."""
+"""The fit of the light to log colours, compared with colours computed from known shadows."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ from tests.conftest import two_balls_scene
 
 
 def surface(count: int = 600):
-    """Random cells of a surface: log colours, the terms of its own colour, and what two lamps hide of it."""
+    """Random cells of a surface: terms of its own colour, shares of sky and lamp blocked for three lamps, and noise."""
     rng = torch.Generator().manual_seed(0)
     points, colours = torch.rand(count, 3, generator=rng), 0.2 * torch.randn(count, 3, generator=rng)
     hidden = torch.rand(3, count, 2, generator=rng) * (torch.rand(3, count, 2, generator=rng) < 0.5)
@@ -29,7 +29,7 @@ LAMPS = [Light(0.0, 0.0, (0.0, 0.0, 1.0), spread, in_colours=True) for spread in
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 @pytest.mark.parametrize("shares", [(0.3, 0.5), (0.6, 0.1), (0.0, 0.7)])
 def test_the_lamp_and_the_shares_of_sky_and_lamp_are_found(shares, outliers):
-    """y = A a + log(1 - hidden s) with noise, and with a tenth of the cells dark for another reason."""
+    """y = A a + log(1 - hidden s) with noise; optionally, a tenth of the cells is dark for another reason."""
     (_, A), hidden, noise = surface()
     own = torch.linspace(-0.3, 0.4, A.shape[1])
     y = A @ own + (1 - hidden[1] @ torch.tensor(shares)).log() + noise
@@ -55,7 +55,7 @@ def test_brightness_without_shadows_has_no_odds():
 
 
 def test_the_own_terms_of_a_surface_leave_out_what_shadows_do():
-    """A shadow changes the brightness by the same logarithm in all channels and no other term."""
+    """A shadow changes the log brightness of all channels equally and no other term."""
     rng = torch.Generator().manual_seed(1)
     points, colours = torch.rand(50, 3, generator=rng), torch.randn(50, 3, generator=rng)
     (before, terms), (after, same) = (_surface_terms(points, c) for c in (colours, colours - 0.7))
@@ -89,7 +89,7 @@ def test_the_terms_of_a_surface_are_of_second_degree_in_place_and_chromaticity()
 
 
 def test_weighted_least_squares():
-    """A line through three points, of which the second counts twice and the third not at all."""
+    """Fit of a line to three points, the second with weight 2 and the third with weight 0."""
     A = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]).double().expand(2, -1, -1)
     y = torch.tensor([[1.0, 3.0, 99.0], [1.0, 3.0, 5.0]]).double()
     weights = torch.tensor([[1.0, 2.0, 0.0], [1.0, 1.0, 1.0]]).double()
@@ -97,11 +97,11 @@ def test_weighted_least_squares():
     found = lighting._solve(A, y, weights)
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
     torch.testing.assert_close(lighting._times(A, found)[1], y[1], rtol=0, atol=2e-5)
-    y[1, 1] = 6.0  # the mean of the residuals is 0 and they are 2, 1 to 4 as 1, -2, 1
+    y[1, 1] = 6.0  # the fitted values are 2, 4 and 6, thus the residuals 1, -2 and 1
     torch.testing.assert_close(lighting._times(A, lighting._solve(A, y, weights))[1] - y[1],
                                torch.tensor([1.0, -2.0, 1.0]).double(), rtol=0, atol=1e-4)  # fmt: skip
     singular = lighting._solve(torch.zeros(1, 3, 2).double(), y[:1], weights[:1])
-    assert not singular.any()  # by the ridge
+    assert not singular.any()  # the ridge makes the solution zero
 
 
 def test_shares_of_sky_and_lamp_stay_below_all_of_the_light():
@@ -113,13 +113,13 @@ def test_shares_of_sky_and_lamp_stay_below_all_of_the_light():
 
 
 def test_cells_are_of_opaque_background_near_the_objects():
-    """The floor of two balls, with bright Gaussians that must not count: transparent, above it, or of an object."""
+    """Floor below two balls, with bright Gaussians that are ignored: transparent, above the floor, or of an object."""
     scene = two_balls_scene()
     g = scene.gaussians
     near = Spheres(torch.tensor([[0.0, 0, 0.15]]), torch.tensor([0.15]), torch.ones(1), torch.tensor([1]))
     support = find_support(scene)
     points, colours = lighting._surface_cells(scene, support, near)
-    assert len(points) > 20 and float(points[:, :2].norm(dim=1).max()) < 0.15 * 4 + 0.1  # 1 + 3 radii, and a cell
+    assert len(points) > 20 and float(points[:, :2].norm(dim=1).max()) < 0.15 * 4 + 0.1  # 1 + 3 radii and one cell
     torch.testing.assert_close(colours, torch.full_like(colours, lighting.GAMMA * math.log(0.5)), atol=1e-3, rtol=0)
     floor = (g.object_id == 0).nonzero()[:, 0]
     for change in ({"opacities": 0.01}, {"object_id": 2}, {"means": 0.3}):

@@ -1,4 +1,4 @@
-"""Objects of several materials: which points are of which part, and the averages that stand for the whole."""
+"""Objects of several materials: assignment of points to parts, and averages for the whole object."""
 
 import json
 
@@ -43,7 +43,7 @@ def test_averages_and_moments_of_a_column(tmp_path):
     mass = 2 * 2000 + 6 * 500  # [kg]
     assert m.density * 8 == pytest.approx(mass)
     assert m.friction == pytest.approx((4000 * 0.4 + 3000 * 0.8) / mass)
-    assert pytest.approx(0.25 / 1e7 + 0.75 / 1e5) == 1 / m.E  # compressed in series
+    assert pytest.approx(0.25 / 1e7 + 0.75 / 1e5) == 1 / m.E  # parts compressed in series
     shift, inertia = uneven_moments(choice, x, volume)
     com = (2000 * (10.5 + 11.5) + 500 * sum(12.5 + k for k in range(6))) / mass
     assert shift.tolist() == pytest.approx([0, 0, com - 14.0])
@@ -69,21 +69,23 @@ def gaussians_at(x: torch.Tensor, object_id: list[int]) -> Gaussians:
 
 
 def write_parts(folder, x: torch.Tensor, object_id: list[int]) -> None:
-    """The Gaussians of a plant on a table, its pot being object 4 and its leaves unlabelled."""
+    """Write the Gaussians of a plant on a table; its pot is object 4 and its leaves are unlabelled."""
     objects = SceneObject(4, "pot"), SceneObject(5, "duck")
     write_scene(folder / "parts.ply", Scene(gaussians_at(x, object_id), objects))
 
 
 @pytest.mark.parametrize("segment", ["pot", 4])
 def test_a_segment_has_what_is_nearest_to_its_gaussians(tmp_path, segment):
-    table = column()[:1] - torch.tensor([0.0, 0.0, 0.7])  # unlabelled too, but never nearest to a point of the plant
+    # unlabelled like the leaves, but never nearest to a point of the plant
+    table = column()[:1] - torch.tensor([0.0, 0.0, 0.7])
     write_parts(tmp_path, torch.cat([column(), table]), [4, 4, 4, 0, 0, 0, 0, 0, 0])
     pot = {"segment": segment, "in": "parts.ply", "below": 2, "material": POT}
     choice = choose(tmp_path, [pot, {"material": LEAF}])
     scene = gaussians_at(torch.cat([column() + 0.01, table]), [1] * 8 + [0])
     found = located(choice, scene, OBJECTS[0])
     inner = column() + torch.tensor([0.2, 0.0, -0.4])
-    assert part_of_points(found, inner).tolist() == [0, 0, 1, 1, 1, 1, 1, 1]  # of the three in the pot one is too high
+    # of the three points in the pot, one is too high
+    assert part_of_points(found, inner).tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
     assert segment_files({1: choice}) == [tmp_path / "parts.ply"]
 
 

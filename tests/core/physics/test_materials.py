@@ -153,6 +153,6 @@ def test_a_softened_material_yields_at_the_same_strain():
 def test_a_file_that_names_an_object_twice_or_by_part_of_its_name():
     with pytest.raises(InputError, match="'' is not an object of this scene; there are: none"):
         find_object(" ", [], "x")
-    assert find_object("3", (*OBJECTS, SceneObject(4, "cup 3")), "").id == 3  # the id before parts of names
+    assert find_object("3", (*OBJECTS, SceneObject(4, "cup 3")), "").id == 3  # ids have priority over parts of names
     with pytest.raises(InputError, match="'cup' fits 2 objects"):
         find_object("cup", (SceneObject(1, "cup a"), SceneObject(2, "cup b")), "x")

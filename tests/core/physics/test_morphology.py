@@ -1,4 +1,4 @@
-"""Morphology of voxel masks, against scipy.ndimage."""
+"""Morphology of voxel masks, compared with scipy.ndimage."""
 
 import numpy as np
 import pytest

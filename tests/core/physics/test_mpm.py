@@ -39,8 +39,9 @@ def momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def energy(p: mpm.Particles, dx: float) -> float:
-    """Kinetic energy (with the affine part) and elastic energy, mu/2 (tr F^T F - 3 - 2 log J) + lambda/2 log(J)^2 per
-    volume [J].
+    """Kinetic energy with the affine part, plus elastic energy [J].
+
+    The density of the elastic energy is mu/2 (tr F^T F - 3 - 2 log J) + lambda/2 log(J)^2.
     """
     F, v, C = p.F.double(), p.v.double(), p.C.double()
     log_J = torch.linalg.det(F).log()
@@ -60,7 +61,7 @@ def test_free_flight_is_a_parabola(device):
     dt = 0.02 / solver.substeps(0.02, g[None])
     expected = p.x.mean(0) + p.v[0] * t + g * t**2 / 2
     torch.testing.assert_close(solver.particles.x.cpu().mean(0), expected, rtol=0, atol=9.81 * t * dt / 2 + 1e-4)
-    assert (solver.particles.F.cpu() - torch.eye(3)).abs().max() < 1e-3  # no deformation
+    assert (solver.particles.F.cpu() - torch.eye(3)).abs().max() < 1e-3  # there is no deformation
 
 
 def test_momentum_and_angular_momentum_are_conserved():
@@ -97,8 +98,8 @@ def test_energy_does_not_grow_and_its_loss_shrinks_with_refinement():
 
 
 def test_a_bar_vibrates_at_its_frequency():
-    # free at both ends, Poisson 0: f = sqrt(E / density) / (2 L). Quadratic splines with 32 cells a wavelength and
-    # free ends resolved to a fraction of a cell: 3 %.
+    # with free ends and Poisson's ratio 0: f = sqrt(E / density) / (2 L). The tolerance of 3 % is for quadratic splines
+    # with 32 cells per wavelength, and for free ends resolved to a fraction of a cell.
     length, E, density, dx = 0.8, 1e5, 500.0, 0.05
     p = block((length, 0.1, 0.1), dx / 2, E, 0.0, density)
     shape = torch.cos(math.pi * p.x[:, 0] / length)
@@ -129,7 +130,7 @@ def test_viscosity_damps_vibration():
 
 @pytest.mark.parametrize("slower", [1.0, 3.0, 10.0])
 def test_a_bar_with_maxwell_branches_loses_the_same_share_of_each_vibration(slower):
-    """Of the energy exp(-2 pi loss) is left after a period, at the upper frequency, a third and a tenth of it."""
+    """After one period, exp(-2 pi loss) of the energy is left, at the upper frequency and at 1/3 and 1/10 of it."""
     loss, E, density, length, dx = 0.15, 1e5, 500.0, 0.4, 0.02
     p = block((length, 0.04, 0.04), dx / 2, E=E, nu=0.0, density=density)
     omega = math.pi * math.sqrt(E / density) / length
@@ -142,7 +143,7 @@ def test_a_bar_with_maxwell_branches_loses_the_same_share_of_each_vibration(slow
         roll(solver, frame, frame=frame)
         signal.append(float((solver.particles.v[:, 0] * shape).sum()))
     s = torch.tensor(signal)
-    turns = ((s[1:-1] - s[:-2]) * (s[2:] - s[1:-1]) < 0).nonzero()[:, 0] + 1  # extremes, half a period apart
+    turns = ((s[1:-1] - s[:-2]) * (s[2:] - s[1:-1]) < 0).nonzero()[:, 0] + 1  # extremes, which are half a period apart
     assert len(turns) >= 4
     kept = float((s[turns[3]] / s[turns[1]]).abs())
     assert kept == pytest.approx(math.exp(-math.pi * loss), rel=0.08)
@@ -161,7 +162,7 @@ def test_maxwell_branches_take_no_momentum_and_carry_no_load():
     for a, b in zip(before, momenta(solver.particles, dx), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=2e-4 * float(a.norm()))
     spun = energy(solver.particles, dx)
-    roll(solver, 1.0)  # it spins on at a constant stretch, to which the branches are relaxed
+    roll(solver, 1.0)  # it spins on with a constant stretch, and the branches relax
     assert energy(solver.particles, dx) == pytest.approx(spun, rel=0.03)
     assert float(solver.particles.branch_strain.abs().max()) < 0.03
 
@@ -191,7 +192,7 @@ def test_a_fall_ends_at_floor_height():
 
 
 def slide(slope: float, friction: float, finer: int = 1) -> tuple[float, float]:
-    """Mean acceleration along a slope [m/s^2] and distance [m] in 0.3 s, once a flat block has started or stopped."""
+    """Mean acceleration along a slope [m/s^2] and distance after 0.3 s [m] of a flat block, after a start-up phase."""
     dx, angle = 1 / 30, math.atan(slope)
     p = block((0.4, 0.1, 0.1), dx / 2, E=5e5, viscosity=200.0, friction=friction)
     solver = mpm.Solver(p, mpm.Box((-1, -1, 0), (2, 1.4, 1)), dx)
@@ -222,7 +223,7 @@ def test_a_block_slides_above_the_friction_angle(slope, friction):
 
 
 def test_friction_does_not_depend_on_the_substep():
-    # a factor per substep, as in the solver of NGFF, would act three times as strongly
+    # a factor per substep, as in the solver of NGFF, would have three times the effect
     assert slide(0.75, 0.5, finer=3)[0] == pytest.approx(rigid(0.75, 0.5), rel=0.07)
 
 
@@ -263,7 +264,7 @@ def test_walls_hold():
     solver = mpm.Solver(p, mpm.Box((-0.1, -0.1, -0.1), (0.4, 0.3, 0.3)), 0.025)
     roll(solver, 0.16)
     assert float(solver.particles.x[:, 0].max()) < 0.4 + 0.025
-    assert float(solver.particles.v[:, 0].mean()) < 0  # bounced
+    assert float(solver.particles.v[:, 0].mean()) < 0  # it has bounced
 
 
 def test_a_held_body_stays_and_supports_others():

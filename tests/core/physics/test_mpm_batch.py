@@ -25,7 +25,7 @@ def scenes() -> dict[str, mpm.Particles]:
 
 @pytest.mark.parametrize("device, schedule", ORDERS)
 def test_scenes_of_a_batch_are_independent(device, schedule):
-    # sums are split into parts at other particles: rounding
+    # equal up to rounding, because sums are split at other particles
     batch = Batch(scenes(), BOX, DX, device)
     together = [frame for frame in batch.frames(7, 0.02, SUBSTEPS, GRAVITY)][-1]
     for name, particles in scenes().items():
@@ -51,7 +51,7 @@ def test_exact_sums_do_not_depend_on_batch_and_order(device):
     low = made["low"]
     backwards = last({"low": mpm.Particles(*(getattr(low, f).flip(0) for f in low.__dataclass_fields__))})
     assert torch.equal(backwards.x.flip(0), together.of("low").x)
-    # and agree with floating-point sums to rounding
+    # exact sums agree with floating-point sums up to rounding
     rough = list(Batch(made, BOX, DX, device).frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
     torch.testing.assert_close(together.x, rough.x, rtol=0, atol=2e-5)
 
@@ -63,7 +63,7 @@ def test_failed_scenes_are_named_and_others_finish(device):
     bad = scenes()
     bad["tall"].v[17] = torch.nan
     bad["lonely"] = block((0.05, 0.05, 0.05), 0.025, low=(0.3, 0.3, 0.3))
-    bad["lonely"].v[:, 0] = 2000.0  # beyond the wall in one substep
+    bad["lonely"].v[:, 0] = 2000.0  # it passes the wall in one substep
     batch = Batch(bad, BOX, DX, device)
     last = list(batch.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
     assert set(batch.failures()) == {"tall", "lonely"}
@@ -87,7 +87,7 @@ def test_a_loss_of_the_first_particle_is_a_failure_at_its_first_frame():
 
 
 def test_number_of_scenes_that_fit_into_the_memory_of_a_gpu(monkeypatch):
-    """A device of twice the memory has room for twice the scenes; one without room is still given one."""
+    """Twice the memory holds twice as many scenes; a device with too little memory still gets one scene."""
     fits = []
     for free in (0, 1 << 30, 1 << 31, 1 << 50):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, free))
@@ -100,7 +100,7 @@ def test_number_of_scenes_that_fit_on_a_cpu():
     count = mpm.make_grid(BOX, DX).count
     fits = Batch.fits(BOX, DX, 1000, "cpu")
     assert fits > 1 and fits * count < 2**31
-    assert Batch.fits(BOX, DX, 1000, "cpu", exact=True) == fits // 2  # sums of 64 bits
+    assert Batch.fits(BOX, DX, 1000, "cpu", exact=True) == fits // 2  # sums have 64 bits
     with pytest.raises(ValueError, match="too many"):
         one = block((0.05, 0.05, 0.05), 0.05)
         mpm.Solver(mpm.join_particles([one] * 40), mpm.Box((-4, -4, 0), (4, 4, 4)), 0.02, sizes=[len(one)] * 40)

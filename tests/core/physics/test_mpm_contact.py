@@ -1,4 +1,4 @@
-"""Bodies with a velocity field each: they neither stick nor pass through, and rub by Coulomb's law."""
+"""Bodies with separate velocity fields neither stick together nor penetrate, and obey Coulomb's law of friction."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ BOX = mpm.Box((-1.0, -1.0, 0.0), (3.0, 1.0, 1.5))
 
 
 def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, held: bool = False) -> mpm.Particles:
-    """Eight particles in a cell of 1e6 Pa and 500 kg/m^3."""
+    """A block with eight particles per cell, a modulus of 1e6 Pa and a density of 500 kg/m^3."""
     axes = [torch.arange(a + DX / 4, b, DX / 2) for a, b in zip(low, high, strict=True)]
     x = torch.cartesian_prod(*axes)
     p = mpm.at_rest(x, (DX / 2) ** 3, mpm.ParticleMaterial(1e6, 0.3, 500.0, 30.0, friction))
@@ -29,7 +29,7 @@ def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, he
 
 @pytest.fixture
 def solve(device):
-    """Positions and velocities of each body after frames of 0.02 s, on the device of the test."""
+    """Function that returns positions and velocities of each body after a number of frames of 0.02 s."""
 
     def solve(bodies: list[mpm.Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
         sizes = [len(b) for b in bodies]
@@ -68,7 +68,7 @@ def test_a_block_slides_on_another_by_v2_over_2_mu_g(solve, friction):
 
 
 def planes(p: mpm.Particles) -> BodyShape:
-    """The shape of a block, whose distance is that from the planes of its faces, also beside them."""
+    """The shape of a block; its distance is that from the planes of its faces, also outside their outlines."""
     h = DX / 2
     low, high = p.rest.amin(0).numpy() - h / 2, p.rest.amax(0).numpy() + h / 2
     size = np.rint((high - low) / h).astype(int) + 10
@@ -77,7 +77,7 @@ def planes(p: mpm.Particles) -> BodyShape:
 
 
 def turned(p: mpm.Particles, degrees: float) -> torch.Tensor:
-    """Turn a block about the y axis, so that its x axis points downhill, and return the rotation."""
+    """Rotate a block about the y axis, so that its x axis points downhill, and return the rotation matrix."""
     a = math.radians(degrees)
     R = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
     p.x, p.F = p.x @ R.mT, R.repeat(len(p), 1, 1)
@@ -86,7 +86,7 @@ def turned(p: mpm.Particles, degrees: float) -> torch.Tensor:
 
 @pytest.mark.parametrize(("degrees", "friction"), [pytest.param(10, 0.0, marks=pytest.mark.slow), (25, 0.3), (40, 0.0)])
 def test_a_block_slides_down_a_slope_as_a_point_mass_does(device, degrees, friction):
-    """Its leading edge is above the face of the slope: the plane of its front face must not stop it."""
+    """The leading edge is above the face of the slope; the plane of the slope's front face must not stop it."""
     slab = block((-0.2, -0.1, -0.1), (0.9, 0.3, 0.0), friction, held=True)
     slider = block((-0.1, 0, 0), (0.1, 0.2, 0.1), friction)
     shapes = [planes(slab), planes(slider)]
@@ -104,7 +104,8 @@ def test_a_block_slides_down_a_slope_as_a_point_mass_does(device, degrees, frict
 
 def test_a_block_rests_on_another_with_a_gap_of_at_most_a_quarter_cell(solve):
     x, v = solve([block((0, 0, 0), (0.3, 0.3, 0.15)), block((0.05, 0.05, 0.18), (0.25, 0.25, 0.38))], 40, G)
-    gap = float(x[1][:, 2].min() - x[0][:, 2].max()) - DX / 2  # a particle is a quarter cell inside its body
+    # particles are a quarter cell below the surface of their body
+    gap = float(x[1][:, 2].min() - x[0][:, 2].max()) - DX / 2
     assert abs(gap) < 0.25 * DX and float(v[1].norm(dim=1).mean()) < 0.02
 
 
@@ -115,7 +116,7 @@ def rise(x: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_block_thrown_on_another_lands_flat(solve):
-    """Its leading edge touches as early as its face does, and it sinks in by at most 3 % of its height."""
+    """The leading edge has contact as early as the face has, and the block penetrates by at most 3 % of its height."""
     upper = block((0.05, 0.1, 0.34), (0.35, 0.4, 0.64), speed=0.5)
     start = upper.x.clone()
     x, _ = solve([block((0, 0, 0), (0.5, 0.5, 0.3)), upper], 15, G)
@@ -141,7 +142,7 @@ def test_a_block_that_falls_on_the_floor_rests_on_it_and_stays_level(solve):
 
 
 def test_sand_rests_on_a_held_block(solve):
-    """Grains have no surface of the body that they were filled from: they touch at the distance of their radius."""
+    """Grains do not have the surface of the body that they were filled from; they have contact at their radius."""
     slab, heap = block((0, 0, 0.2), (0.5, 0.5, 0.3), held=True), block((0.15, 0.15, 0.3), (0.35, 0.35, 0.4))
     heap.model[:], heap.plastic[:, 0] = SAND, 0.4
     x, _ = solve([slab, heap], 10, G)
@@ -158,10 +159,10 @@ def test_three_blocks_at_one_place_keep_their_momentum(solve):
 
 @pytest.mark.parametrize("viscoelastic", [False, True])
 def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(device, viscoelastic):
-    """Three bodies, of which two meet; frames of two lengths, so that graphs are captured and replayed.
+    """Three bodies, two of which collide, in frames of two lengths, so that graphs are captured and replayed.
 
-    Contact amplifies rounding, so the motions may differ by a few times what last bits of the start do to one of them;
-    with Maxwell branches, whose bodies are still in the air after four frames, they are compared then.
+    Contact amplifies rounding: the motions may differ by a few times the effect of changing the last bits of the
+    initial positions. With Maxwell branches, they are compared after four frames, while the bodies are in the air.
     """
     bodies = [block((0, 0, 0), (0.4, 0.3, 0.15)), block((0.1, 0.05, 0.25), (0.3, 0.25, 0.45), speed=1.0),
               block((0.5, 0.05, 0.25), (0.65, 0.2, 0.4), speed=-1.0)]  # fmt: skip

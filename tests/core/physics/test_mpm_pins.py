@@ -1,4 +1,4 @@
-"""Parts of bodies that are pinned: clamped at their face, on a grid that does not know where that is."""
+"""Pinned parts of bodies: they are clamped at their face, wherever it lies relative to the grid."""
 
 import math
 from dataclasses import fields
@@ -16,7 +16,8 @@ from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.pins import OUTSIDE, face_nodes
 from stages.core.physics.mpm.split import SplitSubsteps
 
-SIDE, LENGTH, E, DENSITY = 0.1, 0.5, 2e5, 500.0  # of the beam [m], [Pa], [kg/m^3]
+# of the beam: width and length [m], Young's modulus [Pa], density [kg/m^3]
+SIDE, LENGTH, E, DENSITY = 0.1, 0.5, 2e5, 500.0
 
 
 def rotation(degrees: float, axis: tuple) -> torch.Tensor:
@@ -25,9 +26,9 @@ def rotation(degrees: float, axis: tuple) -> torch.Tensor:
 
 
 def beam(n: int, nu: float, turn: torch.Tensor, shift: tuple) -> tuple[mpm.Particles, float]:
-    """A beam along x, then turned, of n^2 particles in its section, held where x < 0; its grid spacing [m].
+    """A rotated beam, initially along x, with n^2 particles per section, held where x < 0; and the grid spacing [m].
 
-    `shift`: its position relative to the nodes [cells].
+    `shift`: position of the beam relative to the nodes [cells].
     """
     h = SIDE / n
     x = torch.cartesian_prod(torch.arange(-6, round(LENGTH / h)), torch.arange(n), torch.arange(n)) + 0.5
@@ -46,14 +47,15 @@ def solver_of(p: mpm.Particles, dx: float, device: str) -> mpm.Solver:
 
 
 def settle(solver: mpm.Solver, pull: torch.Tensor, omega: float) -> torch.Tensor:
-    """Displacement at rest under an acceleration `pull` of what is free; `omega` of the slowest vibration [rad/s]."""
+    """Displacement at rest under an acceleration `pull` of the free part; `omega` is the lowest frequency [rad/s]."""
     start = solver.particles.x.cpu()
     acceleration = (solver.particles.held.cpu() == 0)[:, None] * pull
-    frame = 0.4 / omega  # eight stable substeps or more: shorter ones, of which a GPU takes eight, are lost in rounding
+    # at least eight stable substeps; a GPU takes eight, and the effect of shorter ones is lost in rounding
+    frame = 0.4 / omega
     for _ in range(30):
         solver.advance(frame, acceleration)
         now = solver.particles
-        kept = math.exp(-1.6 * omega * frame)  # damping near the critical one
+        kept = math.exp(-1.6 * omega * frame)  # nearly critical damping
         solver.set(v=now.v * kept, C=now.C * kept)
     return solver.particles.x.cpu() - start
 
@@ -76,7 +78,7 @@ WAYS = [
 
 @pytest.mark.parametrize(("n", "degrees", "shift"), WAYS)
 def test_a_beam_bends_as_if_it_were_clamped_at_the_face_of_the_pinned_part(n, degrees, shift, device):
-    """By Timoshenko's theory the sag is a L^4 + b L^2. The length is right to a part of a cell, at any resolution."""
+    """By Timoshenko's theory the sag is a L^4 + b L^2. L is right to a fraction of a cell at any resolution."""
     nu = 0.2
     turn, omega = rotation(degrees, (1.0, 1.0, 1.0)), 3.516 * math.sqrt(E / DENSITY / 12) * SIDE / LENGTH**2
     sag, dx = tip_displacement(n, nu, turn, shift, (0.0, 0.0, -0.5), omega, device)
@@ -88,7 +90,7 @@ def test_a_beam_bends_as_if_it_were_clamped_at_the_face_of_the_pinned_part(n, de
 
 @pytest.mark.parametrize(("n", "degrees", "shift"), WAYS)
 def test_a_bar_stretches_as_if_it_were_clamped_at_the_face_of_the_pinned_part(n, degrees, shift, device):
-    """Under its weight by density g L^2 / 2 E, with nodes along the face exactly: the velocity is linear there."""
+    """The stretch under gravity g is density g L^2 / 2 E. If nodes lie along the face, the velocity is linear there."""
     turn, omega = rotation(degrees, (1.0, 1.0, 1.0)), math.pi / 2 / LENGTH * math.sqrt(E / DENSITY)
     stretch, dx = tip_displacement(n, 0.0, turn, shift, (2.0, 0.0, 0.0), omega, device)
     assert math.sqrt(2 * E * stretch / DENSITY / 2.0) == pytest.approx(LENGTH, abs=(0.3 if degrees else 0.05) * dx)
@@ -103,13 +105,14 @@ def test_a_beam_at_rest_does_not_creep(device):
     for _ in range(200):
         solver.advance(0.02, (p.held == 0)[:, None] * pull)
         sag.append(float((solver.particles.x.cpu() - p.x)[tip, 2].mean()))
-    first, *_, last = torch.tensor(sag).reshape(4, 50).mean(1).tolist()  # of a second, a period is .8 s
+    # averages over 1 s, which is longer than the period of 0.8 s
+    first, *_, last = torch.tensor(sag).reshape(4, 50).mean(1).tolist()
     assert first < -0.01 and last == pytest.approx(first, rel=5e-3)
 
 
 @pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow), 6])
 def test_a_pinned_part_of_any_size_holds_what_is_around_it(width, device):
-    """A cube of one to three cells in the middle of a beam that would else fall by half of its thickness."""
+    """A cube of one to three cells in a beam that would otherwise fall by half of its thickness."""
     p, dx = beam(6, 0.3, torch.eye(3), (0.5, 0.6, 0.7))
     middle = p.rest - dx * torch.tensor([0.5, 0.6, 0.7]) - torch.tensor([LENGTH / 2, SIDE / 2, SIDE / 2])
     p.held[:] = (middle.abs() < width * dx / 4).all(1).to(p.held.dtype)
@@ -124,18 +127,19 @@ def test_a_pinned_part_of_any_size_holds_what_is_around_it(width, device):
 
 @pytest.mark.parametrize("degrees", [0, 25])
 def test_nodes_at_a_face_follow_a_linear_profile(degrees):
-    """Slaves are less than OUTSIDE from the face, masters further, and velocities go with distances."""
+    """Slaves are at most OUTSIDE from the face, masters farther; velocities are proportional to the distances."""
     turn = rotation(degrees, (0.2, 1.0, 0.5))
     p, dx = beam(12, 0.3, turn, (0.2, 0.1, 0.4))
     nodes = face_nodes((p.x / dx + 20).double().numpy(), p.volume.double().numpy(), p.held.numpy() == 1)
     led = nodes.masters[:, 0] >= 0
-    back = lambda at: ((at - 20.0) @ turn.double().numpy() - (0.2, 0.1, 0.4)).T  # noqa: E731 -- along the beam [cells]
+    # position relative to the beam, x along it [cells]
+    back = lambda at: ((at - 20.0) @ turn.double().numpy() - (0.2, 0.1, 0.4)).T  # noqa: E731
     d, y, z = back(nodes.slaves[led])
     far, *_ = back(nodes.masters[led])
-    inside = (np.abs(y - 3) < 2) & (np.abs(z - 3) < 2)  # of a section of 6 x 6 cells
+    inside = (np.abs(y - 3) < 2) & (np.abs(z - 3) < 2)  # the inner 4 x 4 cells of the section of 6 x 6
     assert inside.sum() > 40 and d[inside].min() < -1
     assert d[inside].max() < OUTSIDE + 0.1 and far[inside].min() > OUTSIDE - 0.1
-    # where the profile is zero [cells]; the share of an oblique half-space differs from the formula by a few percent
+    # zero of the profile [cells]; the fraction in an oblique half-space differs from the formula by a few percent
     zero = ((d - nodes.ratio[led] * far) / (1 - nodes.ratio[led]))[inside]
     np.testing.assert_allclose(zero, 0, atol=0.15 if degrees else 0.02)
     assert abs(zero.mean()) < 0.02
@@ -144,7 +148,7 @@ def test_nodes_at_a_face_follow_a_linear_profile(degrees):
 
 
 def test_nodes_are_projected_to_the_profiles_in_the_norm_of_their_mass(device):
-    """Against the projection P (P^T M P)^-1 P^T M v on the velocities that the ratios P allow."""
+    """Compared with the projection P (P^T M P)^-1 P^T M v on the velocities that the ratios P allow."""
     rng = np.random.default_rng(0)
     v, mass = rng.normal(size=(12, 3)), rng.uniform(0.5, 2, 12)
     masters, starts, slaves, ratio = [-1, 3, 7], [0, 1, 3, 6], [0, 1, 4, 2, 5, 9], [0.0, 0.4, -0.7, 0.3, -0.2, -1.1]
@@ -165,7 +169,7 @@ def test_nodes_are_projected_to_the_profiles_in_the_norm_of_their_mass(device):
 
 
 def test_the_schedule_for_gpus_gives_the_same_motion_of_what_is_pinned_and_repeats_to_the_bit(device):
-    """Also after another part has been pinned, when graphs have been captured."""
+    """The second case pins another part after graphs were captured."""
     p, dx = beam(6, 0.3, torch.eye(3), (0.3, 0.1, 0.2))
 
     def run(kind):
@@ -189,18 +193,18 @@ def test_the_schedule_for_gpus_gives_the_same_motion_of_what_is_pinned_and_repea
 def test_what_is_released_falls_and_what_has_no_free_neighbours_stays(device):
     p, dx = beam(6, 0.3, torch.eye(3), (0.3, 0.1, 0.2))
     solver, free = solver_of(p, dx, device), torch.zeros_like(p.held)
-    assert torch.equal(solver.particles.held.cpu(), p.held)  # also of those that add nothing to the grid
+    assert torch.equal(solver.particles.held.cpu(), p.held)  # includes particles that add nothing to the grid
     solver.set(held=free)
     solver.advance(0.02, torch.tensor([0.0, 0.0, -9.81]).repeat(len(p), 1))
     assert torch.equal(solver.particles.held.cpu(), free)
     torch.testing.assert_close(
         solver.particles.v.cpu(), torch.tensor([0, 0, -0.1962]).repeat(len(p), 1), atol=1e-3, rtol=0
     )
-    p.held[:] = (p.x[:, 0] < LENGTH - dx).to(p.held.dtype)  # a layer of one cell is left, too thin for a profile
+    p.held[:] = (p.x[:, 0] < LENGTH - dx).to(p.held.dtype)  # the remaining layer of one cell is too thin for a profile
     solver = solver_of(p, dx, device)
     solver.advance(0.1, torch.tensor([0.0, 0.0, -9.81]) * (p.held == 0)[:, None])
     torch.testing.assert_close(solver.particles.x.cpu(), p.x, atol=0.02 * dx, rtol=0)
-    far = (p.x[:, 0] < 0) | (p.x[:, 0] > 0.3)  # pinned and free particles that share no nodes
+    far = (p.x[:, 0] < 0) | (p.x[:, 0] > 0.3)  # pinned and free particles without common nodes
     apart = mpm.Particles(*(getattr(p, f.name)[far] for f in fields(p)))
     apart.held[:] = (apart.x[:, 0] < 0).to(p.held.dtype)
     solver = solver_of(apart, dx, device)

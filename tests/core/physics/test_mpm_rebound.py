@@ -1,4 +1,4 @@
-"""A cube that falls flat on the floor: its vibrations keep a part of the energy, as in linear elastodynamics."""
+"""A cube that falls flat on the floor keeps part of its energy as vibrations, as in linear elastodynamics."""
 
 import math
 
@@ -10,11 +10,12 @@ import torch
 from stages.core.physics.mpm.solver import Box, ParticleMaterial, Solver, SolverOptions, at_rest
 
 E, NU, DENSITY, SIDE = 1e6, 0.3, 540.0, 0.3
-LONG = 6 * SIDE / math.sqrt(E / DENSITY)  # [s]; the contact ends after 2.3 passages of a wave
+# simulated time [s]; the contact lasts 2.3 times as long as a wave takes through the cube
+LONG = 6 * SIDE / math.sqrt(E / DENSITY)
 
 
 def viscosity(loss: float) -> float:
-    """Of a Kelvin-Voigt solid whose slowest longitudinal vibration has this loss factor [Pa s]."""
+    """Viscosity of a Kelvin-Voigt solid whose slowest longitudinal vibration has this loss factor [Pa s]."""
     return loss * E * SIDE / (math.pi * math.sqrt(E / DENSITY))
 
 
@@ -60,7 +61,7 @@ def finite_elements(n: int, loss: float) -> float:
 
 
 def particles(n: int, loss: float) -> tuple[float, float]:
-    """Restitution of a cube of n^3 particles, and the share of its energy that is left."""
+    """Restitution of a cube of n^3 particles, and the share of the energy that remains."""
     h = SIDE / n
     along = (torch.arange(n) + 0.5) * h
     x = torch.cartesian_prod(along - SIDE / 2, along - SIDE / 2, along + 0.05 * h)

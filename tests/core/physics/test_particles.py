@@ -47,7 +47,7 @@ def scene(*bodies: Gaussians, floor: float | None = None) -> Scene:
 
 
 def test_a_shell_is_filled():
-    # voxels on the surface count when their middle is inside; the splats make the ball a standard deviation larger
+    # voxels on the surface count if their centre is inside; the Gaussians enlarge the ball by a standard deviation
     bodies = sample_bodies(scene(splats(sphere())), 8000)
     assert 0.85 * 8000 < len(bodies.x) < 1.1 * 8000
     radius = (3 / (4 * math.pi) * float(bodies.volume.sum())) ** (1 / 3)
@@ -66,18 +66,18 @@ def test_an_open_bowl_stays_hollow():
 
 
 def test_a_shell_with_a_hole_is_filled():
-    """A hole of a third of the diameter: a cavity three times as wide as its leak."""
+    """The hole has a third of the diameter, so the cavity is three times as wide as its leak."""
     points = sphere()
     holed = points[points[:, 2] < 0.1 * math.cos(math.asin(1 / 3))]
     bodies = sample_bodies(scene(splats(holed)), 8000)
     closed = sample_bodies(scene(splats(points)), 8000)
     assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
     over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
-    assert 0.06 < float(over[:, 2].max()) < 0.1  # and the filling does not leak
+    assert 0.06 < float(over[:, 2].max()) < 0.1  # the filling does not leak out
 
 
 def test_the_folds_of_a_cloth_are_not_filled():
-    """Both sides of the shirt of the data set (1 % thick), lying on a floor and in the air."""
+    """Both sides of the shirt of the data set, whose thickness is 1 % of its width, on a floor and in the air."""
     rng, outline, shirt = torch.Generator().manual_seed(0), polygon(rounded(SHIRT)), OBJECTS["cloth"]
     q = (torch.rand(26_000, 2, generator=rng) - 0.5) * torch.tensor([1.04, 0.96])
     q = q[outline(q) < 0][:13_000]
@@ -116,7 +116,7 @@ def test_the_floor_closes_standing_objects():
 
 @pytest.mark.parametrize("floor", [-1.0, 0.0])
 def test_a_box_is_filled_at_every_resolution(floor):
-    """Also where its surface has gaps that closing just misses, in the air and standing on the floor."""
+    """Includes surfaces with gaps slightly too wide for closing, in the air and standing on the floor."""
     surface = box((0.2, 0.2, 0.2), 0.2 / 24).moved((0.0, 0.0, 0.1))
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
     for count in (25_000, 80_000):
@@ -126,7 +126,7 @@ def test_a_box_is_filled_at_every_resolution(floor):
 
 @pytest.mark.parametrize(("spacing", "count"), [(0.012, 2000), (0.02, 20_000)])
 def test_a_rod_whose_gaussians_are_sparse_is_filled(spacing, count):
-    """.3 x .05 x .05, with gaps of many voxels between its Gaussians; a body of separate points would have a tenth."""
+    """A rod with gaps of many voxels between its Gaussians; a body of separate points would have 1/10 of its volume."""
     surface = box((0.3, 0.05, 0.05), spacing)
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
     bodies = sample_bodies(Scene(g, (SceneObject(1, "rod"),)), count)
@@ -135,7 +135,7 @@ def test_a_rod_whose_gaussians_are_sparse_is_filled(spacing, count):
 
 @pytest.mark.parametrize("height", [0.0, 0.2])
 def test_a_photographed_box_without_an_underside_is_filled_from_below(height):
-    """Its walls end between 0 and .02 above what it lies on, be that the floor or not, and two points are below it."""
+    """The walls end 0 to 0.02 m above the supporting surface, floor or not; two points are below that surface."""
     surface = box((0.2, 0.15, 0.1), 0.004).moved((0.0, 0.0, 0.05))
     p = surface.points
     ragged = 0.01 + 0.01 * torch.sin(40 * p[:, 0] + 70 * p[:, 1])
@@ -145,14 +145,14 @@ def test_a_photographed_box_without_an_underside_is_filled_from_below(height):
     for count in (5000, 40_000):
         assert float(sample_bodies(photographed, count).volume.sum()) == pytest.approx(0.003, rel=0.15)
     refined = replace(photographed, provenance={"command": "segment", "scene": {"command": "refine"}})
-    for shell in (alone, refined):  # nothing of it is missing
+    for shell in (alone, refined):  # these shells count as complete
         assert float(sample_bodies(shell, 40_000).volume.sum()) < 0.5 * 0.003 or height == 0.0
     voxels, h = filled_voxels(photographed, 1, 48)
     assert len(voxels) * h**3 == pytest.approx(0.003, rel=0.15)
 
 
 def test_what_covers_another_object_in_photos_is_not_closed_around_it():
-    """Half a sphere over a cube, both without undersides: as if it were alone it would be filled."""
+    """Half a sphere over a cube, both without undersides; without the cube, the half sphere would be filled."""
     points = sphere(20_000)
     cover = splats(points[points[:, 2] > 0.0])
     inner = splats(box((0.06,) * 3, 0.004).points + torch.tensor([0.0, 0.0, 0.03]), 2)
@@ -173,7 +173,7 @@ def test_an_open_bowl_of_photos_stays_hollow():
 
 
 def test_an_object_on_the_floor_is_as_full_as_one_above_it():
-    """A ball with a hole in its side, wider than closing by the floor allows for."""
+    """A ball with a hole in its side that is wider than closing by the floor allows."""
     points = sphere(20_000)
     holed = points[(points - torch.tensor([0.1, 0.0, 0.0])).norm(dim=1) > 0.02] + torch.tensor([0.0, 0.0, 0.1])
     full = [float(sample_bodies(scene(splats(holed), floor=z), 20_000).volume.sum()) for z in (0.0, -1.0)]
@@ -181,7 +181,7 @@ def test_an_object_on_the_floor_is_as_full_as_one_above_it():
 
 
 def test_a_box_has_no_rods_along_its_edges():
-    """Voxels that trimming left there were thickened like sheets, and held other objects at a distance."""
+    """Such rods could remain from trimming, would be thickened like sheets and keep other objects at a distance."""
     surface = box((0.2, 0.2, 0.2), 0.2 / 24)
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
     for count in (6_000, 25_000):
@@ -254,7 +254,7 @@ def test_outliers_are_far_from_the_median():
 
 
 def test_outliers_lie_three_and_a_half_robust_deviations_beyond_the_median_distance():
-    """A median of 1.1 and a median deviation of .2: up to 1.1 + 3.5 x .2 / .6745 = 2.138."""
+    """With median 1.1 and median deviation 0.2 the limit is 1.1 + 3.5 x 0.2 / 0.6745 = 2.138."""
     distances = torch.tensor([0.8, 0.9, 1.0, 1.1, 1.2, 2.13, 2.15])
     line = torch.cat([torch.zeros(1), distances, -distances])
     kept = inliers(line[:, None] * torch.tensor([0.0, 0.6, 0.8]))
@@ -263,7 +263,7 @@ def test_outliers_lie_three_and_a_half_robust_deviations_beyond_the_median_dista
 
 @pytest.mark.parametrize(("photographed", "extended"), [(True, True), (False, False)])
 def test_toppling_objects_of_photos_are_extended_to_the_floor(photographed, extended, caplog):
-    """A slab that leans by twice its thickness: its centre is not above its base."""
+    """The slab leans so much that its centre is displaced by twice its thickness and is not above its base."""
     caplog.set_level("INFO")
     rng = torch.Generator().manual_seed(0)
     p = torch.rand(12000, 3, generator=rng) * torch.tensor([0.06, 0.2, 0.3])
@@ -276,7 +276,7 @@ def test_toppling_objects_of_photos_are_extended_to_the_floor(photographed, exte
 
 
 def test_a_gaussian_much_larger_than_its_object_is_clamped():
-    """Points are within 0.7 standard deviations, of at most a sixth of the diagonal of the object's centres."""
+    """Standard deviations are limited to 1/6 of the diagonal of the object's centres, points to 0.7 of these."""
     g = splats(sphere(500))
     g.scales[0] = 100.0
     size = float((g.means.amax(0) - g.means.amin(0)).norm())
@@ -299,12 +299,12 @@ def test_gaussians_of_any_wrong_value_are_not_usable():
     g = splats(sphere(12))
     g.means[0, 1], g.scales[1, 2], g.quats[2, 3], g.scales[3, 0] = math.nan, math.inf, math.nan, 0.0
     g.quats[4], g.opacities[5], g.scales[6, 1] = 0.0, 0.0199, -1.0
-    g.opacities[7] = 0.0201  # the published limit is .02
+    g.opacities[7] = 0.0201  # the published limit is 0.02
     assert usable(g).tolist() == [False] * 7 + [True] * 5
 
 
 def voxels(shape, *blocks) -> np.ndarray:
-    """A grid with blocks, each by its first and last voxel."""
+    """A grid with blocks, each given by its first and last voxel."""
     out = np.zeros(shape, bool)
     for first, last in blocks:
         out[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))] = True
@@ -315,7 +315,7 @@ def test_specks_smaller_than_a_fiftieth_are_removed():
     large, speck, single = ((1, 1, 1), (4, 5, 5)), ((8, 1, 1), (8, 1, 2)), ((8, 8, 8), (8, 8, 8))
     body = voxels((10, 10, 10), large, speck, single)  # of 100, 2 and 1 voxels
     assert np.array_equal(body_filling._largest(body), voxels(body.shape, large, speck))
-    touching = voxels((10, 10, 10), large, ((5, 6, 6), (5, 6, 6)))  # by a corner
+    touching = voxels((10, 10, 10), large, ((5, 6, 6), (5, 6, 6)))  # they touch at a corner
     assert np.array_equal(body_filling._largest(touching), touching)
 
 
@@ -325,7 +325,7 @@ def test_smaller_bodies_have_the_voxels_that_bodies_share():
     assert np.array_equal(second, small - 5) and len(first) == 1000 - 27
     assert not {*map(tuple, first)} & {*map(tuple, second)}
     inner = large[:MIN_PARTICLES]
-    kept = particles._without_overlap([inner, inner[:-1]])  # nothing would remain of the larger one
+    kept = particles._without_overlap([inner, inner[:-1]])  # the larger body would lose all its voxels
     assert np.array_equal(kept[0], inner) and np.array_equal(kept[1], inner[:-1])
 
 
@@ -341,7 +341,7 @@ def test_skin_is_removed_where_a_body_is_five_voxels_thick():
     (6, 9, False), (8, 11, False), (12, 17, False),
 ])  # fmt: skip
 def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
-    """A room of half width 3 to 12 with a square hole, of a half width of at most two thirds of that of the room."""
+    """Half width of the room 3 to 12; it is filled if the half width of its square hole is at most 2/3 of that."""
     assert filled == ((hole + 1) / 2 <= room / 1.5)
     last = 2 * room
     walls = np.ones((last + 1,) * 3, bool)
@@ -351,7 +351,7 @@ def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
     found = body_filling._cavities(walls, body_filling.LEAK_RADII)
     assert found[room, room, room] == filled and not (found & walls).any()
     assert found[1:-1, 1:-1, 1 : room + 1].all() if filled else not found.any()
-    if filled:  # up to the radius that closes the hole, and a voxel more, below it
+    if filled:  # it is filled up to one voxel below the radius that closes the hole
         assert np.flatnonzero(found[room, room]).max() == last - (hole + 1) // 2 - 1
 
 
@@ -364,7 +364,7 @@ def test_the_outside_reaches_in_through_holes():
 
 
 def test_the_voxels_of_a_body_do_not_depend_on_sparser_neighbours():
-    """Nor on transparent Gaussians: a ball alone, and within a large sparse one and a cloud."""
+    """It does not depend on transparent Gaussians either: a ball alone, and inside a large sparse ball and a cloud."""
     small, large, cloud = splats(sphere(1000)), splats(sphere(2000, 3.0), 2), splats(sphere(2000, 5.0))
     transparent = replace(cloud, opacities=torch.zeros(2000))
     alone = filled_voxels(scene(small), 1, 40)
@@ -375,7 +375,7 @@ def test_the_voxels_of_a_body_do_not_depend_on_sparser_neighbours():
 
 
 def test_gaussians_in_the_same_places_are_sampled_as_densely():
-    """Each of a ball's Gaussians twice, so that the nearest other one is at no distance."""
+    """Each Gaussian of a ball occurs twice, so that the distance to the nearest other one is zero."""
     single = splats(sphere(500), scale=0.05)
     counts = [len(surface_points(scene(g), 1, 0)) for g in (single, concatenate([single, single]))]
     assert counts[0] > 20 * 500 and counts[1] == 2 * counts[0]
@@ -388,7 +388,7 @@ def test_voxels_are_a_part_of_the_object_or_a_third_of_the_spacing_of_its_gaussi
 
 
 def test_a_body_of_few_voxels_grows_about_its_place():
-    """A single Gaussian beside a ball, of which the voxels are coarse."""
+    """A single Gaussian next to a ball, whose size makes the voxels coarse."""
     at = torch.tensor([[0.5, -0.3, 0.2]])
     bodies = sample_bodies(scene(splats(sphere(2000)), splats(at, 2)), 1000)
     x = bodies.x[bodies.body == 1]
@@ -404,7 +404,7 @@ def test_particles_do_not_depend_on_the_unit_of_length(unit):
 
 
 def test_a_cube_sampled_at_every_third_voxel_is_filled():
-    """Between samples its faces may lack their outermost voxels, but nothing below them."""
+    """Between samples the faces may lack their outermost voxels, but no others."""
     side = np.zeros(30, bool)
     side[6:25] = True
     every = np.zeros(30, bool)

@@ -1,4 +1,4 @@
-"""Bodies whose surface is sampled at random: holes between Gaussians, and volumes."""
+"""Bodies with randomly sampled surfaces: sizes of holes between Gaussians, and volumes."""
 
 import math
 
@@ -14,7 +14,7 @@ from tests.core.physics.test_particles import scene, splats
 
 
 def box_samples(sides, n: int, seed: int = 0) -> np.ndarray:
-    """Points (n, 3) at random on the faces of a box around the origin."""
+    """Random points (n, 3) on the faces of a box about the origin."""
     rng, sides = np.random.default_rng(seed), np.asarray(sides, float)
     area = np.tile(sides.prod() / sides, 2)
     face = rng.choice(6, n, p=area / area.sum())
@@ -24,18 +24,19 @@ def box_samples(sides, n: int, seed: int = 0) -> np.ndarray:
 
 
 def l_samples(length: float, thickness: float, width: float, n: int) -> np.ndarray:
-    """Points (about n, 3) at random on an upright L of two plates."""
+    """Random points (about n, 3) on an upright L of two plates."""
     sides = np.array([[length, width, thickness], [thickness, width, length - thickness]])
     area = (sides.prod(1, keepdims=True) / sides).sum(1)
     foot, wall = (
         box_samples(s, int(n * share), k) for k, (s, share) in enumerate(zip(sides, area / area.sum(), strict=True))
     )
     x = np.concatenate([foot + [length / 2, 0, thickness / 2], wall + [thickness / 2, 0, (length + thickness) / 2]])
-    return x[(np.abs(x[:, 2] - thickness) > 1e-9) | (x[:, 0] > thickness)]  # not where both touch
+    # without the faces at which the plates touch
+    return x[(np.abs(x[:, 2] - thickness) > 1e-9) | (x[:, 0] > thickness)]
 
 
 def bowl_samples(inner: float, outer: float, n: int) -> np.ndarray:
-    """Points at random on half a spherical shell, open above."""
+    """Random points on half a spherical shell that is open above."""
     rng = np.random.default_rng(1)
     area = np.array([2 * inner**2, 2 * outer**2, outer**2 - inner**2])
     part = rng.choice(3, n, p=area / area.sum())
@@ -52,14 +53,14 @@ def ball_samples(n: int, seed: int = 0) -> np.ndarray:
 
 
 def in_the_air(points: np.ndarray, area: float) -> Scene:
-    """Gaussians at points on a surface of this area, as wide as in reconstructions."""
+    """Scene with Gaussians at points on a surface of this area, as large as in reconstructions."""
     at = torch.from_numpy(points) + torch.tensor([0.0, 0.0, 2.0])
     return scene(splats(at, scale=0.4 * (area / len(points)) ** 0.5), floor=0.0)
 
 
 @pytest.mark.parametrize("n", [500, 8000])
 def test_holes_between_random_points_are_as_wide_as_theory_says(n):
-    """On a unit ball, where faces of the convex hull are the Delaunay triangles: no point is inside their circles."""
+    """On a unit ball, faces of the convex hull are the Delaunay triangles, whose circumcircles contain no point."""
     widest = []
     for seed in range(20):
         hull = ConvexHull(ball_samples(n, seed))
@@ -91,14 +92,14 @@ BODIES = {
 
 @pytest.mark.parametrize("name", BODIES)
 def test_bodies_with_random_surfaces_have_their_volume(name):
-    """The bowl of 6,000 Gaussians had 1.33 of it, since it was hollow between two thick sheets, the thick one .57."""
+    """Earlier, the bowl of 6,000 Gaussians had 1.33 of its volume (hollow between thick sheets), the thick one 0.57."""
     points, area, volume = BODIES[name]
     assert rigid_shapes(in_the_air(points, area), 0, 0.0)[0].volume == pytest.approx(volume, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [3000, 20_000])
 def test_volumes_are_those_of_the_particles_also_where_their_number_is_not_reached(count):
-    """The number of voxels of a leaky plate jumps with their size, so that the search for it does not converge."""
+    """The number of voxels of a leaky plate is discontinuous in their size, so that the search does not converge."""
     points = torch.from_numpy(box_samples((0.4, 0.4, 0.05), 6000, 1)) + torch.tensor([0.0, 0.0, 2.0])
     bodies = sample_bodies(scene(splats(points, scale=0.005), floor=0.0), count)
     assert 0.8 < float(bodies.volume.sum()) / 0.008 < 1.25

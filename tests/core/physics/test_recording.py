@@ -1,4 +1,4 @@
-"""Recordings that --forces repeats: trajectories and what a page has saved."""
+"""Recordings that --forces repeats: trajectories and files saved by a page."""
 
 import json
 
@@ -20,7 +20,7 @@ SAVED = {"options": {"dt": 0.01, "engine": "ngff", "keypoints": 64, "material": 
 def test_prompts_and_options_come_back(tmp_path):
     file = tmp_path / "done.json"
     file.write_text(json.dumps(SAVED))
-    options = {"dt": 0.01, "engine": "ngff", "keypoints": 64, "material": ("1=foam",)}  # not those that name files
+    options = {"dt": 0.01, "engine": "ngff", "keypoints": 64, "material": ("1=foam",)}  # options that do not name files
     assert read_recording(file) == Recording(PROMPTS, options, 30)
     repeated = with_recorded(SimulateOptions(forces=file, keypoints=128))
     assert (repeated.dt, repeated.steps, repeated.keypoints, repeated.material) == (0.01, 30, 128, ("1=foam",))

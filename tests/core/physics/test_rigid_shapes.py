@@ -1,4 +1,4 @@
-"""Rigid bodies of objects: hulls, moments of solids, and balls."""
+"""Rigid bodies of objects: convex hulls, moments of inertia, and balls."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from tests.conftest import two_balls_scene
 
 @cache
 def scene(surface: Surface) -> Scene:
-    """Surfaces are told apart by identity."""
+    """Scene with one object; cached, because Surface is hashed by identity."""
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
     return Scene(g, (SceneObject(1, "thing"),))
 
@@ -28,7 +28,7 @@ def scene(surface: Surface) -> Scene:
 def test_a_box_is_convex_with_its_own_volume_and_inertia():
     a, b, c = sides = (0.2, 0.1, 0.3)
     shape = rigid_shapes(scene(box(sides, 0.01).moved((1.0, 2.0, 3.0))))[0]
-    assert shape.convex and shape.volume == pytest.approx(a * b * c, rel=0.02)  # edges between points are cut
+    assert shape.convex and shape.volume == pytest.approx(a * b * c, rel=0.02)  # edges between the points are cut off
     torch.testing.assert_close(shape.com, torch.tensor([1.0, 2.0, 3.0]), rtol=0, atol=1e-4)
     expected = shape.volume / 12 * torch.diag(torch.tensor([b * b + c * c, a * a + c * c, a * a + b * b]))
     torch.testing.assert_close(shape.inertia, expected, rtol=0.02, atol=1e-6)
@@ -54,7 +54,7 @@ def test_an_egg_is_round_to_one_percent():
 
 
 def test_a_ball_does_not_reach_into_another_object():
-    """A ball of which a tenth of the height is cut off on a block: the rest of the ball would be inside it."""
+    """A ball without 1/10 of its height on a block: a complete ball would penetrate the block."""
     dome = ellipsoid((0.1,) * 3, 3000)
     dome = together(dome.kept(dome.points[:, 2] > -0.08), disc(0, 0.06, -0.08))
     block = box((0.3, 0.3, 0.1), 0.01).moved((0.0, 0.0, -0.131))
@@ -66,11 +66,11 @@ def test_a_ball_does_not_reach_into_another_object():
 
 
 def test_inertia_of_two_cubes_that_are_one_object():
-    """Cubes of side .1, at .2 on both sides of the middle: their own inertia and that of their places."""
+    """Cubes of side 0.1 with centres 0.2 to both sides of the middle: own inertia plus that of their positions."""
     cubes = [(box((0.1,) * 3, 0.01).moved((x, 0.0, 0.0)), lambda p: p[:, 0] > 9) for x in (-0.2, 0.2)]
     shape = rigid_shapes(scene(union(*cubes)))[0]
     side = (shape.volume / 2) ** (1 / 3)
-    assert side == pytest.approx(0.1, abs=0.5 / 48)  # to a voxel
+    assert side == pytest.approx(0.1, abs=0.5 / 48)  # accurate to a voxel
     own = side**2 / 6
     expected = torch.diag(torch.tensor([own, own + 0.04, own + 0.04]))
     torch.testing.assert_close(shape.inertia / shape.volume, expected, rtol=0.02, atol=0.02 * own)
@@ -78,7 +78,7 @@ def test_inertia_of_two_cubes_that_are_one_object():
 
 @pytest.mark.parametrize("counts", [(1, 1, 1), (2, 3, 1)])
 def test_moments_of_full_voxels_are_those_of_their_box(counts):
-    """V / 12 (b^2 + c^2) about the axis across sides b and c, and a half-full voxel counts half."""
+    """V / 12 (b^2 + c^2) about the axis perpendicular to sides b and c; a half-full voxel counts half."""
     h, first = 0.1, np.array([1.0, 2.0, 3.0])
     x = first + h * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(-1, 3)
     volume, com, inertia = _voxel_moments(x, np.ones(len(x)), h)
@@ -93,7 +93,7 @@ def test_moments_of_full_voxels_are_those_of_their_box(counts):
 
 
 def test_what_is_below_the_floor_is_cut_off():
-    """A cube sunk in by a quarter of its height; one that is below the floor as a whole keeps its upper layer."""
+    """A cube is a quarter below the floor; one that is completely below keeps its topmost layer."""
     cube = scene(box((0.2,) * 3, 0.01))
     shape = rigid_shapes(cube, bottom=-0.05)[0]
     assert shape.volume == pytest.approx(0.75 * 0.2**3, rel=0.03)
@@ -103,12 +103,12 @@ def test_what_is_below_the_floor_is_cut_off():
 
 
 def test_a_sparse_ball_on_the_floor_is_filled():
-    """Its gaps leak where the floor is part of the surface; a shell would not fill its hull."""
+    """It has gaps where the floor closes the surface; a shell would have much less volume than its hull."""
     assert rigid_shapes(two_balls_scene())[0].convex
 
 
 def disc(inner: float, outer: float, z: float, spacing: float = 0.005) -> Surface:
-    """Points on a ring or a disc at height z."""
+    """Points on a disc or ring at height z."""
     k = torch.arange(int(math.pi * (outer**2 - inner**2) / spacing**2)) + 0.5
     r = (inner**2 + k * spacing**2 / math.pi).sqrt()
     turn = k * math.pi * (1 + 5**0.5)
@@ -117,7 +117,7 @@ def disc(inner: float, outer: float, z: float, spacing: float = 0.005) -> Surfac
 
 
 def wall(radius: float, low: float, high: float, spacing: float = 0.005) -> Surface:
-    """Points on a cylinder about z."""
+    """Points on a cylinder surface about z."""
     turn = torch.arange(int(2 * math.pi * radius / spacing)) * spacing / radius
     a, z = torch.meshgrid(turn, torch.arange(low + spacing / 2, high, spacing), indexing="ij")
     out = torch.stack([a.cos(), a.sin(), torch.zeros_like(a)], -1).reshape(-1, 3)
@@ -129,25 +129,25 @@ def together(*surfaces: Surface) -> Surface:
 
 
 def plate(thickness: float) -> tuple[Surface, float]:
-    """A disc of radius .15, and its volume."""
+    """A disc of radius 0.15, and its volume."""
     r, t = 0.15, thickness
     return together(disc(0, r, 0.0), disc(0, r, t), wall(r, 0.0, t)), math.pi * r**2 * t
 
 
 def pan(thickness: float) -> tuple[Surface, float]:
-    """A pan of radius .15 and height .06, and the volume of its walls."""
+    """A pan of radius 0.15 and height 0.06, and the volume of its walls."""
     r, h, t = 0.15, 0.06, thickness
     surface = together(disc(0, r, 0.0), disc(0, r - t, t), wall(r, 0.0, h), wall(r - t, t, h), disc(r - t, r, h))
     return surface, math.pi * (r**2 * h - (r - t) ** 2 * (h - t))
 
 
 def half_ball(inner: float) -> tuple[Surface, float]:
-    """Half a spherical shell of outer radius .3, and its volume."""
+    """Half a spherical shell of outer radius 0.3, and its volume."""
     return bowl(inner, 0.3), 2 / 3 * math.pi * (0.3**3 - inner**3)
 
 
 def test_a_concave_object_has_its_convex_hull_and_the_moments_of_what_it_fills():
-    """A dumb-bell of two balls that meet in a ring: its hull is a capsule."""
+    """The object is a dumb-bell of two overlapping balls; its convex hull is a capsule."""
 
     def sphere(x):
         centre = torch.tensor([x, 0.0, 0.0])
@@ -158,7 +158,7 @@ def test_a_concave_object_has_its_convex_hull_and_the_moments_of_what_it_fills()
     to_axis = (shape.hull - torch.tensor([0.09, 0.0, 0.0]) * shape.hull[:, :1].sign()).norm(dim=1)
     torch.testing.assert_close(to_axis, torch.full((len(shape.hull),), 0.1), rtol=0, atol=0.005)
     torch.testing.assert_close(shape.com, torch.zeros(3), rtol=0, atol=0.002)
-    lens = math.pi * (4 * 0.1 + 0.18) * (2 * 0.1 - 0.18) ** 2 / 12  # that both contain
+    lens = math.pi * (4 * 0.1 + 0.18) * (2 * 0.1 - 0.18) ** 2 / 12  # volume of the intersection of both balls
     assert shape.volume == pytest.approx(8 / 3 * math.pi * 1e-3 - lens, rel=0.03)
 
 
@@ -170,7 +170,7 @@ SHEETS = {"plate 1/20": plate(0.015), "plate 1/80": plate(0.00375), "pan 1/15": 
     pytest.param(name, marks=pytest.mark.slow) if name in ("bowl 1/30", "pan 1/15") else name for name in SHEETS
 ])  # fmt: skip
 def test_thin_walls_keep_their_volume(name):
-    """Walls of a twelfth to an eightieth of the size: the mass is right to 10 %."""
+    """Walls of 1/12 to 1/80 of the size; the mass is right to 10 %."""
     surface, true = SHEETS[name]
     shape = rigid_shapes(scene(surface))[0]
     assert shape.volume == pytest.approx(true, rel=0.1)
@@ -178,7 +178,7 @@ def test_thin_walls_keep_their_volume(name):
 
 
 def test_a_flat_box_is_convex():
-    """Its height of 12.8 voxels is not a whole number, which must not make it look hollow."""
+    """The height of 12.8 voxels is not a whole number; this must not make it seem hollow."""
     (shape,) = rigid_shapes(scene(box((0.3, 0.2, 0.08), 0.011)))
     assert shape.convex and shape.volume == pytest.approx(0.0048, rel=0.02)
 
@@ -187,7 +187,7 @@ CARD = box((0.09, 0.06, 0.002), 0.003)
 
 
 def test_a_card_that_is_as_thin_as_a_voxel_has_its_volume():
-    """45 times as wide as thick; its voxels have two thirds of that. But for half a spacing at its edges."""
+    """The card is 45 times as wide as thick; its voxels hold 2/3 of its volume. Half a spacing is missing at edges."""
     shape = rigid_shapes(scene(CARD))[0]
     sides = CARD.points.amax(0) - CARD.points.amin(0)
     assert shape.convex and shape.volume == pytest.approx(float(sides.prod()), rel=0.03)
@@ -195,7 +195,7 @@ def test_a_card_that_is_as_thin_as_a_voxel_has_its_volume():
 
 @pytest.mark.parametrize("name", ["angle", "bent"])
 def test_thin_plates_with_another_outline_or_bent_are_not_convex(name):
-    """Of an L of three quarters of the card, and of a card with its ends 6 mm above its middle."""
+    """An L of three quarters of the card, and a card with its ends 6 mm above its middle."""
     x = CARD.points
     if name == "angle":
         plate = CARD.kept((x[:, 0] < 0) | (x[:, 1] < 0))

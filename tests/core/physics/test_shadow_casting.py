@@ -1,4 +1,4 @@
-"""Shadows of a moved block and ball on photos under a known light: found, lifted and drawn anew."""
+"""Shadows of a moved block and ball on photos with a known light: detected, removed and drawn again."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ from tests.core.raster.lit_world import (
     photograph,
 )
 
-RING = 0.35  # around the centres of the objects, at rest and moved [m]
+RING = 0.35  # radius around the centres of the objects, at rest and moved [m]
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +48,14 @@ def psnr(a, b) -> float:
 def rings(xy: torch.Tensor) -> torch.Tensor:
     """Pixels of bare floor around the objects."""
     near = [(xy - torch.tensor(at[:2])).norm(dim=-1) < RING for p in (REST, MOVED) for at in (p.block, p.ball)]
-    return torch.stack(near).any(0)  # nan is in none
+    return torch.stack(near).any(0)  # nan is in none of the rings
 
 
 def test_light_is_found_in_the_shadows_of_the_photos(world):
     light = world[2].light
     assert light.in_colours and angle(light.direction, LIGHT.direction) < 20
     assert light.lamp == pytest.approx(LIGHT.lamp, abs=0.15) and 0.2 < light.sky < 0.7
-    assert light.beneath < 0.5  # beneath the block it is dark, as in this world nothing was filled in
+    assert light.beneath < 0.5  # it is dark beneath the block, because nothing was filled in there in this world
 
 
 def test_light_is_the_same_on_every_device(world, device):
@@ -67,7 +67,7 @@ def test_light_is_the_same_on_every_device(world, device):
 
 
 def test_without_shadows_in_the_photos_the_light_is_overhead(world):
-    """Texture alone is not taken for shadows; neither is a scene without a floor."""
+    """Neither texture nor a scene without a floor is mistaken for shadows."""
     _, _, caster = world
     rest = caster.occluders.rest
     assert estimate_light(lit_scene(Light(0.0, 0.0, (0.0, 0.0, 1.0), 0.1, True)), rest) == OVERHEAD
@@ -76,7 +76,7 @@ def test_without_shadows_in_the_photos_the_light_is_overhead(world):
 
 
 def test_rings_around_moved_objects_come_nearer_to_the_true_photos(world):
-    """PSNR to ray-cast photos of the moved world, 18 to 19 dB without shadows, rises by at least 4 dB."""
+    """PSNR relative to ray-cast photos of the moved world, 18 to 19 dB without shadows, increases by 4 dB or more."""
     scene, keypoints, caster = world
     positions = moved_points(keypoints.rest, keypoints.object_id, MOVED)
     moved = deform(scene.gaussians, bind_gaussians(scene, keypoints), keypoints, positions)
@@ -127,11 +127,11 @@ def test_spheres_have_the_volume_and_the_outline_of_their_object(world):
         own = rest.object_id == id
         assert float((4 / 3 * math.pi * rest.radii[own] ** 3).sum()) == pytest.approx(volume, rel=0.25)
         area = float((rest.weights[own] * math.pi * rest.radii[own].square()).sum())
-        assert area == pytest.approx(outline, rel=0.25)  # a quarter of a convex body's surface (Cauchy)
+        assert area == pytest.approx(outline, rel=0.25)  # a quarter of a convex body's surface area (Cauchy)
 
 
 def test_outlines_are_seen_from_all_around():
-    """Along the axes and the face and space diagonals of a cube: 13 axes, no direction being preferred."""
+    """The 13 axes are those of a cube, its face diagonals and its space diagonals; no direction is preferred."""
     assert len(_VIEWS) == 13
     torch.testing.assert_close(_VIEWS.norm(dim=1), torch.ones(13))
     torch.testing.assert_close(_VIEWS.mT @ _VIEWS, 13 / 3 * torch.eye(3))

@@ -26,11 +26,12 @@ def box_distance(x: torch.Tensor, sides: tuple) -> torch.Tensor:
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (1.0, 0.6, 0.1)])
 def test_distance_and_inertia_of_a_box(sides, device):
-    """Above faces the distance is exact but for gaps between random points; at edges it is off by part of a gap."""
+    """Above faces the distance is exact up to gaps between random points; at edges it deviates by a part of a gap."""
     grid = on_the_cpu(distance_grid(box_surface(sides, 3000).to(device), 0.02))
     x = grid.nodes()
     error = (grid.values - box_distance(x, sides)).abs()
-    above = (0.5 * torch.tensor(sides) - x.abs() > 0.15).sum(-1) == 2  # three times the points' distance from edges
+    # the points' distance from edges is at least three times that from the surface
+    above = (0.5 * torch.tensor(sides) - x.abs() > 0.15).sum(-1) == 2
     near = box_distance(x, sides).abs() < 0.04
     assert error[above & near].quantile(0.98) < 1e-3 and error[above & near].max() < 0.01
     assert error[near].square().mean().sqrt() < 0.01
@@ -49,7 +50,7 @@ def test_inertia_of_a_ball(device):
 
 
 def test_an_open_shell_has_no_inside(device):
-    """A sheet is solid only within its thickness, and so is a hemisphere, whose inside can be reached."""
+    """A sheet is solid only within its thickness; the same holds for a hemisphere, whose inside can be reached."""
     rng = torch.Generator().manual_seed(0)
     flat = torch.rand(2000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
     grid = on_the_cpu(distance_grid(flat.to(device), 0.04))
@@ -60,11 +61,11 @@ def test_an_open_shell_has_no_inside(device):
     half[:, 2] = -half[:, 2].abs()  # open above
     grid = on_the_cpu(distance_grid(half.to(device), 0.04))
     inner = grid.nodes().norm(dim=-1) < 0.7
-    assert (grid.values[inner] > 0).float().mean() > 0.9  # not near the rim
+    assert (grid.values[inner] > 0).float().mean() > 0.9  # the exceptions are near the rim
 
 
 def test_missing_points_do_not_open_a_body(device):
-    """A box without the lower tenth of its surface, as photos show objects on a table."""
+    """A box without the lower tenth of its surface, like objects on a table in photos."""
     points = box_surface((1.0, 1.0, 1.0), 4000)
     points = points[points[:, 2] > -0.49]
     grid = on_the_cpu(distance_grid(points.to(device), 0.02))
@@ -75,19 +76,19 @@ def test_missing_points_do_not_open_a_body(device):
 
 
 def test_exchanged_axes_exchange_the_distances(device):
-    """Points inside a body have equal sides; which of them is outside must not depend on the sign of an eigenvector."""
+    """Points inside a body have equal sides; the choice of the outer one must not depend on an eigenvector's sign."""
     inner = 0.3 * (torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) - 0.5)
     points = torch.cat([box_surface((1.0, 0.6, 0.5), 4000), inner]).double().to(device)
     values = distance_grid(points, 0.02).values
     exchanged = distance_grid(points[:, [1, 0, 2]], 0.02).values.transpose(0, 1)
     assert (values.abs() - exchanged.abs()).abs().max() < 1e-6
-    different = (values - exchanged).abs() > 1e-4  # nodes in the plane of a disc beside it: either sign
+    different = (values - exchanged).abs() > 1e-4  # nodes in the plane of a disc beside it can have either sign
     assert different.float().mean() < 1e-4
     assert (values.abs() * different).max() < 0.1 * 0.02
 
 
 def test_rounding_changes_no_distance(device):
-    """Faces on nodes of the grid, whose planes hold nodes beside the body: their distance must not depend on noise."""
+    """Faces lie on nodes of the grid; the distance of nodes beside the body must not depend on rounding errors."""
     points = box_surface((1.0, 0.6, 0.5), 2000).double()
     noise = 1e-12 * torch.randn(points.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     one, other = (distance_grid(p.to(device), 0.02).values for p in (points, points + noise))

@@ -18,7 +18,7 @@ TURN = matrix(torch.tensor([0.3, 0.5, -0.2, 0.7]))
 
 
 def scene_of(kind: str) -> Scene:
-    """Two objects and a background; the first as a cloud, a flat sheet, a line, two points or one."""
+    """Two objects and a background; the first object is a cloud, a flat sheet, a line, two points or one point."""
     g = random_gaussians(900, degree=2)
     g = replace(g, object_id=torch.arange(900) % 3)
     flat = {"cloud": (1, 1, 1), "sheet": (1, 1, 0), "line": (1, 0, 0), "two": (1, 1, 1), "one": (1, 1, 1)}[kind]
@@ -74,7 +74,7 @@ def test_gaussians_on_a_device_with_keypoints_on_the_cpu(device):
 
 
 def test_a_line_rotates_with_its_direction():
-    # points on a line do not tell the turn about it, so only positions and lengths can be asked for
+    # points on a line do not define the rotation about it, so only positions and lengths are tested
     g, binding, keypoints = prepared(scene_of("line"))
     moved = deform(g, binding, keypoints, keypoints.rest @ TURN.mT + 1)
     mine = g.object_id == 1
@@ -165,7 +165,7 @@ def test_a_scene_without_objects_has_no_keypoints():
 
 
 def test_a_gaussian_follows_a_single_keypoint():
-    """The first of all; the others of its row are padding."""
+    """It follows the first of the row; the others are padding."""
     g, u = random_gaussians(3), torch.tensor([[0.1, -0.2, 0.3]])
     keypoints = Keypoints(torch.zeros(1, 3), torch.ones(1, dtype=torch.int64))
     binding = Binding(torch.tensor([[0, -1], [-1, -1], [0, -1]]), torch.tensor([[1.0, 0], [0, 0], [1, 0]]))

@@ -1,4 +1,4 @@
-"""Speeds of pressure waves, and the substeps and batches that follow from them."""
+"""Speeds of pressure waves, and the substeps and batches that result from them."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ from stages.core.physics.mpm.solver import (
 
 @pytest.mark.parametrize(("nu", "stiffening"), [(0.0, 1.0), (0.25, 1.2), (0.4, 0.6 / 0.28), (-0.5, 1.5)])
 def test_speed_of_pressure_waves(nu, stiffening):
-    """Of a bar held at its sides: (1 - nu) / ((1 + nu) (1 - 2 nu)) times as stiff as a free one."""
+    """Laterally confined bars are stiffer than free ones by (1 - nu) / ((1 + nu) (1 - 2 nu))."""
     assert wave_speed(9e6, nu, 1000.0) == pytest.approx((9e3 * stiffening) ** 0.5)
     assert modulus_at_wave_speed(wave_speed(9e6, nu, 1000.0), nu, 1000.0) == pytest.approx(9e6)
     assert wave_speed(9e6, nu, 4000.0) == pytest.approx(wave_speed(9e6, nu, 1000.0) / 2)
@@ -76,7 +76,7 @@ def test_particles_that_are_held_need_no_substeps():
 
 
 def test_lame_parameters_of_youngs_modulus_and_poissons_ratio():
-    """mu = E / 2 (1 + nu), and a bulk modulus lambda + 2 mu / 3 of E / 3 (1 - 2 nu)."""
+    """mu = E / 2 (1 + nu); the bulk modulus lambda + 2 mu / 3 is E / 3 (1 - 2 nu)."""
     E, nu, viscosity = torch.tensor([1e5, 2e6, 3e7]), torch.tensor([0.0, 0.3, 0.45]), torch.tensor([0.0, 1.0, 2.0])
     ones = torch.ones(3)
     mu, lam, eta = at_rest(torch.zeros(3, 3), ones, ParticleMaterial(E, nu, ones, viscosity, ones)).stiffness.T

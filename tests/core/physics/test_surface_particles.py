@@ -46,7 +46,7 @@ def test_cells_at_inclined_faces_are_filled_in_part(degrees):
     back = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
 
     def error(bodies) -> float:
-        """Root mean square of the error of the filled fraction of the particles' cells."""
+        """Root mean square error of the filled fraction of the particles' cells."""
         points = (torch.floor(bodies.x / bodies.spacing)[:, None] + offsets) * bodies.spacing
         true = ((points @ back).abs() < SIDES / 2).all(2).float().mean(1)
         return float((bodies.volume / bodies.spacing**3 - true).square().mean().sqrt())
@@ -61,7 +61,7 @@ def test_bodies_that_overlap_share_their_voxels():
     bodies = surface_particles(scene, sample_bodies(scene, 2000, skin=True), 2)
     voxels = torch.floor(bodies.x / bodies.spacing).long()
     own = torch.cat([voxels, bodies.body[:, None]], 1)
-    assert len(own.unique(dim=0)) == len(own)  # a particle in each voxel
+    assert len(own.unique(dim=0)) == len(own)  # each voxel has one particle
     keys, at = voxels.unique(dim=0, return_inverse=True)
     filled = torch.zeros(len(keys)).index_add(0, at, bodies.volume) / bodies.spacing**3
     assert float(filled.max()) <= 1 + 1e-5 and len(keys) < len(voxels)
@@ -69,7 +69,7 @@ def test_bodies_that_overlap_share_their_voxels():
 
 
 def test_a_small_body_beside_a_large_one_has_no_particles_outside():
-    """Where a particle's voxel is larger than the grid of the body's signed distances goes beyond it."""
+    """Outside is where particles' voxels are so large that they extend beyond the grid of its signed distances."""
     surfaces = [box((0.6,) * 3, 0.02).moved((0.0, 0.0, 0.3)), box((0.15,) * 3, 0.006).moved((0.6, 0.0, 0.075))]
     parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1, widest=math.inf)
              for i, s in enumerate(surfaces)]  # fmt: skip
@@ -92,7 +92,7 @@ def test_a_sheet_stays_thick_enough_to_hold_together():
     assert len(surface_particles(scene, coarse).x) > 0.95 * len(coarse.x)
     fine = surface_particles(scene, coarse, 2)
     columns, layers = torch.floor(fine.x[:, :2] / fine.spacing).unique(dim=0, return_counts=True)
-    inner = ((columns * fine.spacing - 0.25).abs() < 0.2).all(1)  # away from the border
+    inner = ((columns * fine.spacing - 0.25).abs() < 0.2).all(1)  # away from the border of the body
     assert float((layers[inner] >= 4).float().mean()) > 0.95 and float(fine.volume.sum()) == pytest.approx(
         float(coarse.volume.sum()), rel=0.06
     )

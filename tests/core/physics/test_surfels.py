@@ -1,4 +1,4 @@
-"""The steps of signed distances, each on cases done by hand."""
+"""The steps of computing signed distances, each with cases computed by hand."""
 
 import math
 
@@ -9,7 +9,7 @@ from stages.core.geometry.neighbours import neighbour_index
 from stages.core.physics import signed_distance
 from stages.core.physics.signed_distance import DIRECTIONS, DistanceGrid, Surfels, mass_properties
 
-INSIDE = -torch.ones(1, dtype=torch.float64)  # of a position, by its rays
+INSIDE = -torch.ones(1, dtype=torch.float64)  # sign of a position inside the body, as determined by its rays
 
 
 def grid_of(distance, low, cell, resolution=32):
@@ -24,7 +24,7 @@ def test_nodes_are_cells_apart_along_each_axis():
 
 
 def test_mass_of_a_ball_whose_distances_are_exact():
-    """Cells of other lengths along each axis, and a centre beside the origin; second order in the size of a cell."""
+    """The cells have different lengths along each axis, and the centre is not the origin; the error is second order."""
     centre = torch.tensor([1.0, -2.0, 0.5])
     grid = grid_of(lambda x: (x - centre).norm(dim=-1) - 0.8, [0.0, -3.0, -0.5], [0.066, 0.064, 0.062])
     volume, com, inertia = mass_properties(grid)
@@ -45,7 +45,7 @@ def test_inertia_of_a_leaning_rod_is_that_of_its_direction():
     values, axes = torch.linalg.eigh(inertia)
     assert float((axes[:, 0] @ along).abs()) == pytest.approx(1, abs=1e-3)
     torch.testing.assert_close(values[1], values[2], rtol=0.01, atol=0)
-    cylinder, ball = length * radius**2, 4 / 3 * radius**3  # shares of the volume, over pi
+    cylinder, ball = length * radius**2, 4 / 3 * radius**3  # volumes divided by pi
     about = (cylinder * radius**2 / 2 + ball * 0.4 * radius**2) / (cylinder + ball)
     assert float(values[0]) == pytest.approx(about, rel=0.03)
     across = cylinder * (radius**2 / 4 + length**2 / 12)
@@ -73,8 +73,8 @@ def test_openness_is_the_fraction_of_rays_that_leave():
     assert (signed_distance._openness(surface) == 1).all() and len(DIRECTIONS) == 26
     surface[:, :, 4] = True
     open_ = signed_distance._openness(surface)
-    assert float(open_[4, 4, 2]) == pytest.approx(17 / 26)  # 9 rays go up
-    assert float(open_[0, 4, 3]) == pytest.approx(20 / 26)  # of which 3 leave at the side before
+    assert float(open_[4, 4, 2]) == pytest.approx(17 / 26)  # 9 of the 26 rays go up
+    assert float(open_[0, 4, 3]) == pytest.approx(20 / 26)  # 3 of these leave at the side before
     box = torch.ones(9, 9, 9, dtype=torch.bool)
     box[1:-1, 1:-1, 1:-1] = False
     assert float(signed_distance._openness(box)[4, 4, 4]) == 0
@@ -82,7 +82,7 @@ def test_openness_is_the_fraction_of_rays_that_leave():
     assert float(signed_distance._openness(box)[4, 4, 4]) == pytest.approx(2 / 26)
     far = torch.zeros(9, 9, 9, dtype=torch.bool)
     far[8, 0, 0] = True
-    assert float(signed_distance._openness(far)[0, 0, 0]) == pytest.approx(25 / 26)  # 8 nodes away
+    assert float(signed_distance._openness(far)[0, 0, 0]) == pytest.approx(25 / 26)  # the surface is 8 nodes away
 
 
 def plane(step=0.1, count=9):
@@ -97,7 +97,7 @@ def test_discs_lie_in_the_plane_of_their_neighbours():
     discs = signed_distance._unoriented(points, neighbour_index(points))
     torch.testing.assert_close((discs.normal @ turned[:, 2]).abs(), torch.ones(81, dtype=torch.float64))
     middle = discs.radius.reshape(9, 9)[1:-1, 1:-1]
-    torch.testing.assert_close(middle, torch.full_like(middle, 0.1))  # the fourth neighbour
+    torch.testing.assert_close(middle, torch.full_like(middle, 0.1))  # distance of the fourth neighbour
     assert discs.radius.reshape(9, 9)[0, 0] == pytest.approx(0.2) and not discs.half_thickness.any()
     assert len(signed_distance._unoriented(points[:2], neighbour_index(points[:2])).radius) == 2
 
@@ -114,7 +114,7 @@ def disc(radius=0.2, half_thickness=0.0):
     ((0, -0.7, -0.4), -0.5),
 ])  # fmt: skip
 def test_distance_to_a_disc_and_to_its_edge(x, expected):
-    """Discs reach OVERLAP = 2 times as far as their radius of .2."""
+    """Discs extend to OVERLAP = 2 times their radius of 0.2."""
     x = torch.tensor([x], dtype=torch.float64)
     nearest = (x.norm(dim=1, keepdim=True), torch.zeros(1, 1, dtype=torch.int64))
     assert float(signed_distance._distance(disc(), x, nearest, INSIDE)) == pytest.approx(expected)
@@ -137,7 +137,7 @@ def test_distances_to_discs_are_averaged_by_their_nearness_but_not_across_an_edg
     weight = math.exp((0.3**2 - 0.4**2) / 0.2**2)
     found = float(signed_distance._distance(two, x, nearest, INSIDE))
     assert found == pytest.approx((0.3 + weight * 0.4) / (1 + weight))
-    two.normal[1] = torch.tensor([0, 0.9, math.sqrt(0.19)])  # its cosine with the first is .44
+    two.normal[1] = torch.tensor([0, 0.9, math.sqrt(0.19)])  # its cosine with the first normal is 0.44
     assert float(signed_distance._distance(two, x, nearest, INSIDE)) == pytest.approx(0.3)
     two.normal[1] = torch.tensor([0, math.sqrt(1 - 0.6**2), 0.6])
     assert float(signed_distance._distance(two, x, nearest, INSIDE)) != pytest.approx(0.3)
@@ -147,7 +147,7 @@ def test_distances_to_discs_are_averaged_by_their_nearness_but_not_across_an_edg
     ((0, 0, 0.14), True), ((0, 0, -0.16), False), ((0.34, 0, 0.1), True), ((0.36, 0, 0.1), False),
 ])  # fmt: skip
 def test_nodes_on_a_disc_are_three_quarters_of_a_cell_away_at_most(node, on):
-    cell = torch.tensor([0.5, 0.5, 0.2], dtype=torch.float64)  # along the normal: .15
+    cell = torch.tensor([0.5, 0.5, 0.2], dtype=torch.float64)  # 3/4 of a cell along the normal: 0.15
     node, index = torch.tensor([node], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.int64)
     assert bool(signed_distance._on_surface(disc(), node, index, cell)) == on
 

@@ -1,4 +1,4 @@
-"""The steps from points on a surface to voxels, and from voxels to convex hulls, each on cases done by hand."""
+"""The steps from surface points to voxels and from voxels to convex hulls, each with cases computed by hand."""
 
 import itertools
 import math
@@ -33,16 +33,16 @@ def grid(*sides, step):
 
 def test_spacing_is_the_median_distance_to_the_nearest_other():
     line = torch.tensor([0.0, 1.0, 3.0, 7.0, 15.0])[:, None] * torch.tensor([[0.6, 0.8, 0.0]])
-    assert particles._spacing(line) == pytest.approx(2.0)  # 1, 1, 2, 4, 8
-    assert particles._spacing(grid(20, 20, 20, step=0.3)) == pytest.approx(0.3)  # more points than are looked at
+    assert particles._spacing(line) == pytest.approx(2.0)  # distances are 1, 1, 2, 4, 8
+    assert particles._spacing(grid(20, 20, 20, step=0.3)) == pytest.approx(0.3)  # more points than are sampled
     assert particles._spacing(torch.ones(1, 3)) == 0.0
 
 
 def test_gap_is_nine_tenths_of_the_distances_to_the_third_neighbour():
     line = np.arange(2000.0)[:, None] * np.array([[0.0, 0.0, 0.5]])
-    assert particles._gap(line) == pytest.approx(1.0)  # neighbours at .5, .5 and 1 within a line
+    assert particles._gap(line) == pytest.approx(1.0)  # distances to neighbours within a line are 0.5, 0.5 and 1
     cluster = np.concatenate([line[:1700], 5000 * (1 + np.arange(300))[:, None] * np.ones((1, 3))])
-    assert particles._gap(cluster) > 1000  # 15 % of the points are alone
+    assert particles._gap(cluster) > 1000  # 15 % of the points are isolated
 
 
 def test_size_of_a_scene_leaves_out_one_percent_at_each_end_and_the_background():
@@ -66,12 +66,12 @@ def test_usable_gaussians_are_finite_of_positive_size_turned_and_opaque():
 
 
 def test_points_of_a_surface_fill_ellipsoids_of_seven_tenths_of_the_gaussians():
-    """Uniform in the ball of radius .7: the mean square of a coordinate is .7^2 / 5 of the squared deviation."""
-    quat = torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])  # a quarter turn about z: local x becomes y
+    """Points are uniform in the ball of radius 0.7, so a coordinate's mean square is 0.7^2 / 5 of a variance."""
+    quat = torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])  # rotation by 90 degrees about z, so local x becomes y
     g = splats(grid(12, 12, 1, step=1.0))
     g = replace(g, quats=quat.repeat(144, 1), scales=torch.tensor([2.0, 1.0, 0.01]).repeat(144, 1))
     points = surface_points(scene(g), 1, seed=0)
-    each = 8  # 4 x the product of the larger deviations, in squares of the spacing of 1
+    each = 8  # 4 x the product of the two larger standard deviations, for a spacing of 1
     assert len(points) == 144 * (1 + each)
     away = points[144:].reshape(144, each, 3) - g.means.numpy()[:, None]
     local = away[..., [1, 0, 2]] / np.array([2.0, 1.0, 0.01])
@@ -88,11 +88,12 @@ def test_small_gaussians_are_sampled_once():
 
 
 def test_the_skin_of_a_cube_of_nine_voxels():
-    """The outer layer of each face, without what is more than 3 steps from the 5 voxels in the middle."""
+    """The outer layer of each face, without voxels more than 3 steps from the central 5 voxels."""
     cube = filled((13, 13, 13), block(9, 9, 9, low=(2, 2, 2)))
     skin = body_filling.thick_skin(cube)
     assert skin.sum() == 6 * (5 * 5 + 2 * 2 * 5) and not skin[3:10, 3:10, 3:10].any()
-    assert not body_filling.thick_skin(filled((13, 13, 13), block(9, 9, 4, low=(2, 2, 2)))).any()  # too thin
+    # it is too thin for a skin
+    assert not body_filling.thick_skin(filled((13, 13, 13), block(9, 9, 4, low=(2, 2, 2)))).any()
 
 
 def test_trimming_removes_the_skin_whose_points_are_inside_the_centres_of_its_voxels():
@@ -106,7 +107,7 @@ def test_trimming_removes_the_skin_whose_points_are_inside_the_centres_of_its_vo
 
 def test_components_smaller_than_a_fiftieth_of_the_largest_are_removed():
     large, small, smaller = block(10, 10, 1), block(2, 1, 1, low=(0, 0, 5)), block(1, 1, 1, low=(9, 9, 9))
-    touching = np.array([[9, 10, 1]])  # at a corner of the large one
+    touching = np.array([[9, 10, 1]])  # touches a corner of the large block
     body = filled((12, 12, 12), large, small, smaller, touching)
     assert (body_filling._largest(body) == filled(body.shape, large, touching)).all()  # 101 / 50 > 2
     body[9, 10, 1] = False
@@ -130,7 +131,8 @@ def test_voxels_of_two_bodies_go_to_the_smaller_one():
     kept_a, kept_b = particles._without_overlap([a, b])
     assert set(map(tuple, kept_b)) == set(map(tuple, b)) and set(map(tuple, kept_a)) == set(map(tuple, a)) - shared
     inner = block(4, 4, 3, low=(0, 0, 0))
-    same = particles._without_overlap([inner, inner])  # neither would keep MIN_PARTICLES but the first
+    # both keep all, because one would otherwise have less than MIN_PARTICLES
+    same = particles._without_overlap([inner, inner])
     assert len(inner) >= MIN_PARTICLES and [len(x) for x in same] == [48, 48]
     left = particles._without_overlap([block(5, 8, 2), block(3, 8, 2)])
     assert [len(x) for x in left] == [80, 48]  # 32 voxels would remain
@@ -151,8 +153,8 @@ def test_moments_of_the_hull_of_a_box_and_of_a_tetrahedron():
     corner = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     volume, com, inertia = rigid_shapes._solid_moments(rigid_shapes._hull(corner))
     assert volume == pytest.approx(1 / 6) and com.tolist() == pytest.approx([0.25] * 3)
-    np.testing.assert_allclose(np.diag(inertia), 2 * (1 / 60 - 1 / 96), rtol=1e-5)  # integral of x^2 is 1 / 60
-    np.testing.assert_allclose(inertia[0, 1], -(1 / 120 - 1 / 96), rtol=1e-5)  # of x y 1 / 120
+    np.testing.assert_allclose(np.diag(inertia), 2 * (1 / 60 - 1 / 96), rtol=1e-5)  # the integral of x^2 is 1 / 60
+    np.testing.assert_allclose(inertia[0, 1], -(1 / 120 - 1 / 96), rtol=1e-5)  # the integral of x y is 1 / 120
 
 
 def test_no_hull_of_points_in_a_plane():

@@ -1,4 +1,4 @@
-"""Choices by name, and the device of --device."""
+"""Selection of backends by name, and the device of --device."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Shapes in annotations are checked while tests run: first, and from time to time."""
+"""Shapes in annotations are checked in the first calls of each test and in some of the later ones."""
 
 from collections.abc import Iterator
 from importlib.util import find_spec

@@ -19,7 +19,7 @@ def ball(centre: tuple, radius: float, object_id: int):
 
 
 def bodies(*parts) -> set[frozenset[int]]:
-    """Objects by the numbers of the parts that they are made of."""
+    """Objects, each given by the numbers of its parts."""
     scene = scene_of(table_gaussians(), *parts)
     parts, ids = scene.gaussians.object_id, merge_bodies(scene.gaussians, find_support(scene)).object_id
     mine = {n: int(ids[parts == n].unique()) for n in parts.unique().tolist()}
@@ -30,7 +30,8 @@ def test_interlocking_parts_are_one_body():
     belly = coloured_gaussians(ellipsoid((0.06, 0.06, 0.1), 2500).moved((0.0, 0.0, 0.1)), (0.5, 0.5, 0.5), 1)
     sides = [brick((-0.065, y, 0.07), (0.065, y + 0.02, 0.11), 2) for y in (-0.065, 0.045)]
     front = [brick((x, -0.045, 0.07), (x + 0.02, 0.045, 0.11), 2) for x in (-0.065, 0.045)]
-    legs = [brick((0.045, y, 0.0), (0.065, y + 0.02, 0.07), 2) for y in (-0.065, 0.045)]  # they stand by themselves
+    # they stand on the table by themselves
+    legs = [brick((0.045, y, 0.0), (0.065, y + 0.02, 0.07), 2) for y in (-0.065, 0.045)]
     assert bodies(belly, *sides, *front, *legs) == {frozenset({1, 2})}
 
 
@@ -49,7 +50,8 @@ def test_suspended_parts_merge_and_supported_ones_do_not():
     post = brick((-0.03, -0.03, 0.0), (0.03, 0.03, 0.2), 1)
     on_top = ball((0.0, 0.0, 0.25), 0.05, 2)
     assert bodies(post, on_top) == {frozenset({1}), frozenset({2})}
-    plait = brick((0.032, -0.02, 0.06), (0.07, 0.02, 0.21), 2)  # at its side, and not down to the table
+    # it is at the side of the post and does not extend down to the table
+    plait = brick((0.032, -0.02, 0.06), (0.07, 0.02, 0.21), 2)
     assert bodies(post, plait) == {frozenset({1, 2})}
     leaning = brick((0.032, -0.02, 0.0), (0.07, 0.02, 0.15), 2)
     assert bodies(post, leaning) == {frozenset({1}), frozenset({2})}

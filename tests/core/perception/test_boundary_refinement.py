@@ -29,7 +29,7 @@ def truth():
 
 
 def skirted(scene, width):
-    """Labels with the table around each object given to it."""
+    """Labels in which the table within `width` [m] of each object has the label of that object."""
     g, ids = scene.gaussians, scene.gaussians.object_id.clone()
     for n in (1, 2, 3):
         near = torch.cdist(g.means[:, :2], g.means[g.object_id == n][:, :2]).amin(1) < width
@@ -41,7 +41,7 @@ def test_table_labelled_as_object_is_corrected(truth):
     wrong, true = skirted(truth, 0.02), truth.gaussians.object_id
     found = refine_boundaries(relabelled(truth, wrong), find_support(truth)).object_id
     seen = shown(truth)
-    taken = (wrong > 0) & (true == 0) & seen  # some of it is under an object, where no photo shows it
+    taken = (wrong > 0) & (true == 0) & seen  # without the Gaussians under an object, which no photo shows
     assert taken.sum() > 200 and (found[taken] == 0).float().mean() > 0.99
     assert min(iou((found == n) & seen, (true == n) & seen) for n in (1, 2, 3)) > 0.99
 
@@ -57,7 +57,7 @@ def test_object_labelled_as_table_is_corrected(truth):
 def test_table_of_another_colour_is_corrected():
     patch = table_gaussians()
     stained = (patch.means[:, 0] > 0.05) & (patch.means[:, 1].abs() < 0.12)
-    patch.sh[stained, 0] -= 0.8  # dark, and reaching from the block to where the table is sure
+    patch.sh[stained, 0] -= 0.8  # a dark patch that extends from the block to where the table is certain
     scene = scene_of(patch, block((0.0, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1), noise=0.0005)
     true = scene.gaussians.object_id
     ids = torch.where((true == 0) & (scene.gaussians.means[:, 0] - 0.1).abs().lt(0.06)
@@ -72,7 +72,7 @@ def test_true_labels_and_invisible_gaussians_are_unchanged(truth):
     assert (found == truth.gaussians.object_id).float().mean() > 0.998
     below = truth.gaussians.means.clone()
     buried = torch.nonzero(truth.gaussians.object_id == 1)[:5, 0]
-    below[buried] = torch.tensor([0.3, 0.3, -0.05])  # under the table, that hides it
+    below[buried] = torch.tensor([0.3, 0.3, -0.05])  # under the table, which hides it
     hidden = replace(truth, gaussians=replace(truth.gaussians, means=below))
     assert (refine_boundaries(hidden, support).object_id[buried] == 1).all()
     blind = relabelled(replace(truth, cameras=None), skirted(truth, 0.02))

@@ -44,7 +44,7 @@ def test_thin_objects_are_kept(size):
 
 
 def test_partially_labelled_phone_is_kept():
-    """What was missed shows all over it, level with it, and is no table."""
+    """Its unlabelled Gaussians lie at its own height all over it and must not count as table."""
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.14, 0.07, 0.009), (0.8, 0.1, 0.1), 1), noise=0.0005)
     true = scene.gaussians.object_id
     ids = torch.where(torch.arange(len(true)) % 5 == 0, 0, true)

@@ -1,4 +1,4 @@
-"""The outline of a table: where cameras see the ground past its edges."""
+"""The outline of a table, detected from cameras that see the ground beyond its edges."""
 
 from dataclasses import replace
 
@@ -18,9 +18,9 @@ def test_the_edges_of_a_table_are_where_the_ground_is_seen():
             other = 0.8 * along * (HIGH[0] + HIGH[1] - half)
             at = np.stack([other, other], 1)
             at[:, axis] = side * half
-            # a cell is .013, the pixels of the depth maps about as large
+            # a cell has 0.013 m, and pixels of the depth maps are about as large
             np.testing.assert_allclose(outline.beyond(at), 0, atol=0.03)
-    assert GROUND - 0.01 < outline.ground < GROUND + 0.04  # depth maps take the nearest of 3 x 3 pixels
+    assert GROUND - 0.01 < outline.ground < GROUND + 0.04  # depth maps contain the minimum of 3 x 3 pixels
 
 
 def test_a_table_that_fills_the_photos_has_no_edge():
@@ -39,7 +39,7 @@ def test_nothing_under_the_table_and_no_cameras_give_no_edge():
 
 
 def test_objects_that_stand_at_its_height_are_on_the_table():
-    """One beyond the cells that are seen as table, and a leg beside it that goes down to the ground, which is not."""
+    """One object is beyond the visible table; a leg next to the table extends to the ground and is not on it."""
     slab = level(0.005, (0.5, -0.03), (0.6, 0.03), 0.01, 0.5)
     leg = level(0.005, (-0.6, -0.03), (-0.5, 0.03), 0.01, 0.5)
     down = torch.tensor([0.0, 0.0, 0.4]) * torch.rand(len(leg), 1, generator=torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""Outlines of objects cut by colour in the views."""
+"""Outlines of objects, refined by colour in the views."""
 
 from dataclasses import replace
 
@@ -63,14 +63,14 @@ def test_holes_are_filled_but_for_other_objects():
 
 def test_an_object_of_few_pixels_keeps_them():
     labels = np.zeros((40, 40), np.int64)
-    labels[10:16, 10:16] = 1  # less than MIN_PIXELS
+    labels[10:16, 10:16] = 1  # fewer than MIN_PIXELS
     assert (labels > 0).sum() < MIN_PIXELS
     assert (cut_outlines(np.zeros((40, 40, 3), np.uint8), labels, {1: 3.0}, 0) == labels).all()
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """Toys on a table and six cameras, 1 m away."""
+    """Toys on a table and six cameras at a distance of 1 m."""
     eyes = orbit(6, torch.tensor([0.0, 0.0, 0.11]), 1.0, 30.0)
     Ks, sizes = intrinsics(400, 300, 475.0).expand(6, 3, 3), torch.tensor([[400, 300]] * 6)
     return replace(falling_toys(), cameras=Cameras(eyes, Ks, sizes, tuple("abcdef")))
@@ -91,7 +91,7 @@ def test_a_ring_of_table_around_each_object_is_given_back(scene):
 
 
 def panel(x, z, y, rgb, number):
-    """Gaussians .03 apart on a plane across the viewing direction."""
+    """Gaussians 0.03 m apart in a plane perpendicular to the viewing direction."""
     means = torch.stack([x.flatten(), torch.full((x.numel(),), y), z.flatten()], 1)
     n = len(means)
     quats, scales = torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.tensor([0.02, 0.002, 0.02]).expand(n, 3)

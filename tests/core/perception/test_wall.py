@@ -1,4 +1,4 @@
-"""Objects on a wall."""
+"""Detection of objects on a wall."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def test_wall_is_rotated_to_the_floor():
     turn = find_wall(scene, view_extent(scene))
     laid = rotate_wall_to_floor(scene, turn)
     wall = laid.gaussians.means[scene.gaussians.object_id == 0]
-    assert float(wall[:, 2].abs().median()) < 0.002  # the noise
+    assert float(wall[:, 2].abs().median()) < 0.002  # the noise of the points
     assert float(laid.gaussians.means[scene.gaussians.object_id > 0][:, 2].min()) > -0.004
     back = transformed(laid.gaussians, turn.inverse())
     torch.testing.assert_close(back.means, scene.gaussians.means, rtol=0, atol=1e-5)
@@ -40,15 +40,15 @@ def test_objects_on_a_wall_are_found():
     found = group_objects(blank)
     assert len(found.objects) == 3
     assert min(best_overlap(found.gaussians.object_id, scene.gaussians.object_id).values()) >= 0.9
-    assert torch.equal(found.gaussians.means, scene.gaussians.means)  # numbered where it is, not moved
+    assert torch.equal(found.gaussians.means, scene.gaussians.means)  # the scene is labelled, not rotated
 
 
 @pytest.mark.parametrize(
     "scene",
     [
-        three_apart(),  # a table is no wall
-        replace(three_apart(), floor=None),  # found or not
-        hung(scene_of(block((0.0, 0.0), (0.4, 0.4, 0.1), (0.8, 0.1, 0.1), 1))),  # nor is the front of a book
+        three_apart(),  # a table is not a wall
+        replace(three_apart(), floor=None),  # not even if the floor height is unknown
+        hung(scene_of(block((0.0, 0.0), (0.4, 0.4, 0.1), (0.8, 0.1, 0.1), 1))),  # the front of a book is not a wall
         replace(hung(three_apart()), cameras=None),  # the visible side is unknown
     ],
     ids=["floor", "table", "book", "no cameras"],

@@ -1,1 +1,1 @@
-"""The player in a real browser."""
+"""Tests of the player in a real browser."""

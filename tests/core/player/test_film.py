@@ -1,4 +1,4 @@
-"""The container of a page: values come back within half a step, and a film stays small."""
+"""The container of a page: values are accurate to half a quantisation step, and films are small."""
 
 import json
 import struct
@@ -15,7 +15,7 @@ from tests.core.player.test_player import motion_of
 
 
 def unpack(data: bytes) -> dict:
-    """The arrays of a container, read as web/container.js reads them."""
+    """The arrays of a container, read in the same way as by web/container.js."""
     data = zlib.decompress(data)
     (length,) = struct.unpack("<I", data[:4])
     out = {}
@@ -60,13 +60,14 @@ def test_keypoints_that_do_not_move_stay_exactly_at_rest():
 
 
 def test_a_film_of_100k_gaussians_has_less_than_12_megabytes():
-    """Bytes for a Gaussian and for a keypoint frame do not depend on their number; harmonics of degree 3 are noise."""
+    """Sizes per Gaussian and per keypoint frame are constant; harmonics of degree 3 are noise."""
     n = 4000
     scene = Scene(random_gaussians(n, degree=3, size=0.01), (SceneObject(1, "a"), SceneObject(2, "b")))
     scene.gaussians.object_id[:] = torch.arange(n) % 3
     motion = motion_of(scene, frames=100)
     player, still, film = (len(film_page(data, "")) for data in (b"", pack_film(scene), pack_film(scene, motion)))
-    keypoint_frame = (film - still) / (2 * 64 * len(motion.positions))  # with the binding
+    # size of a keypoint in a frame [B], including the binding
+    keypoint_frame = (film - still) / (2 * 64 * len(motion.positions))
     assert player + (still - player) / n * 100_000 + keypoint_frame * 3 * 1024 * 100 < 12e6
 
 

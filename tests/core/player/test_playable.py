@@ -1,4 +1,4 @@
-"""A playable film: the page computes the motion that the learned engine computes, and the mouse drags its objects."""
+"""A playable film: the page computes the same motion as the learned engine, and the mouse can drag its objects."""
 
 import base64
 import json
@@ -21,7 +21,7 @@ from stages.simulate.stage import run as simulate
 from tests.browser import drag_up, until
 from tests.conftest import ball, ring, two_balls_scene
 
-LIMIT = 1e-3  # between the page and the engine, after 50 frames [m]
+LIMIT = 1e-3  # maximum distance between the results of page and engine after 50 frames [m]
 RUN = """async (films) => {
   const { unpack } = await import("player/container.js"), { engineInput } = await import("player/local.js");
   const { FieldEngine } = await import("player/engine.js"), out = [];
@@ -32,11 +32,11 @@ RUN = """async (films) => {
     out.push(Array.from(engine.positions()));
   }
   return out;
-}"""  # the last positions of the keypoints of each film
+}"""  # returns the last positions of the keypoints of each film
 RISE = """() => {
   const ids = player.film.arrays.keypoint_object, own = [...ids.keys()].filter((k) => ids[k] === 1);
   return own.reduce((sum, k) => sum + player.positions[3 * k + 2] - player.rest[3 * k + 2], 0) / own.length;
-}"""  # of object 1
+}"""  # returns the mean rise of object 1 [m]
 
 
 FIND = """() => {
@@ -44,7 +44,7 @@ FIND = """() => {
   for (let y = 50; y < 350; y += 20) for (let x = 250; x < 780; x += 20)
     if (player.pick(x, y)?.object === 1) hits.push([x, y]);
   return hits[hits.length >> 1];
-}"""  # a point of object 1 beside the panel [px]
+}"""  # returns a point of object 1 next to the panel [px]
 
 
 def thing(centre, radii, id):
@@ -55,14 +55,14 @@ def thing(centre, radii, id):
 
 
 def scene_of(*things):
-    """Ellipsoids (centre, radii) on a floor at 0."""
+    """A scene with ellipsoids (centre, radii) and its floor at 0."""
     gaussians = concatenate([thing(*t, id) for id, t in enumerate(things, start=1)])
     objects = tuple(SceneObject(id, f"thing {id}") for id in range(1, len(things) + 1))
     return Scene(gaussians, objects, ring(), 0.0)
 
 
 BALL, FLAT, TALL = (0.1, 0.1, 0.1), (0.2, 0.15, 0.06), (0.06, 0.08, 0.2)
-SCENES = {  # scene, options
+SCENES = {  # scene and options by name
     "a fall": (scene_of(((0, 0, 0.5), BALL)), {}),
     "two meet": (two_balls_scene(), {"velocity": ("object=2 -0.8,0,0",)}),
     "a push at a point": (two_balls_scene(), {"force": ("object=1 force=0,40,10 from=0.1 to=0.3 at=-0.3,0.1,0.2",)}),
@@ -91,7 +91,7 @@ def playable(trajectory):
 
 
 def page_and_engine(folder, open_page, names, device, frames=51):
-    """For each scene the largest distance between the keypoints of the page and of the engine in the last frame [m]."""
+    """Yield for each scene the largest distance between keypoints of page and engine in the last frame [m]."""
     trajectories = [simulated(folder, scene, frames, **options) for scene, options in map(SCENES.get, names)]
     films = [playable(t) for t in trajectories]
     (folder / "film.html").write_text(film_page(films[0], "parity"))
@@ -108,7 +108,7 @@ def test_the_page_computes_the_motion_of_the_engine(tmp_path, open_page, device)
 
 @pytest.mark.slow  # Firefox takes seconds to start
 def test_firefox_computes_the_motion_of_the_engine(tmp_path, open_firefox, device):
-    """Called directly, and as the page does in its worker."""
+    """The engine is called directly, and by the page in its worker."""
     pages = []
 
     def open_once(path):
@@ -138,7 +138,7 @@ def test_the_mouse_takes_an_object_out_of_the_film(tmp_path, open_page):
     until(page, f"player.live.state?.arrows.length === 1 && ({RISE})() > 0.05")
     page.mouse.up()
     assert not page.is_visible("#time")
-    page.keyboard.press("b")  # back to the film
+    page.keyboard.press("b")  # returns to the film
     until(page, f"({RISE})() === 0")
     assert page.is_visible("#time") and page.evaluate("player.live.running") is False
 
@@ -168,12 +168,12 @@ GO_TO = """([frame]) => Promise.all(["local", "engine"].map((name) => import(`pl
     engine.goTo(frame);
     while (engine.frame < player.film.frames - 1) engine.advance();
     return Array.from(engine.positions());
-  })"""  # the end of a film whose last frames are computed from within it
+  })"""  # returns the last positions of a film after recomputing its last frames
 
 
 @pytest.mark.usefixtures("device")
 def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
-    """A change of the first visit of the frame does not remain, and one of the film is repeated."""
+    """A change made at the first visit of the frame must be forgotten, and one of the film must be repeated."""
     (tmp_path / "given.json").write_text(json.dumps({"options": {}, "frames": 16, "prompts": [
         {"kind": "change", "what": "gravity", "value": 4.0, "start": 0.1, "object_id": None}]}))  # fmt: skip
     options = {"velocity": ("object=2 -0.8,0,0",), "forces": tmp_path / "given.json"}
@@ -187,7 +187,7 @@ def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
 @pytest.mark.parametrize("first", [pytest.param(0, marks=pytest.mark.slow), 6])
 @pytest.mark.usefixtures("device")
 def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, open_page, first):
-    """From a frame of the film on, step by step: a drag by the mouse, a push and a pin."""
+    """Starting from a frame of the film, frame by frame: a drag by the mouse, a push and a pin."""
     simulated(tmp_path, two_balls_scene(), frames=8, velocity=("object=2 -0.8,0,0",), box="-1,-1,0,1,1,1.5")
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True, view="input:0")))
     page.set_viewport_size({"width": 800, "height": 400})
@@ -218,7 +218,7 @@ def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, o
     simulate(tmp_path / "scene.ply", tmp_path / "again.h5", SimulateOptions(forces=tmp_path / "done.json"))
     again = read_trajectory(tmp_path / "again.h5")
     forces = [f for f in again.info.forces if f["kind"] == "force"]
-    assert len(again) == frames + 3 and len(forces) == 17  # the drag, with what balances the weight, and the push
+    assert len(again) == frames + 3 and len(forces) == 17  # the drag, the forces that balance the weight, and the push
     assert min(f["start"] for f in forces) > first * 0.02
     assert [f["what"] for f in again.info.forces if f["kind"] == "change"] == ["pinned"]
     assert (again.positions[-1] - shown).norm(dim=1).max() < LIMIT

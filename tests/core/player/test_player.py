@@ -1,4 +1,4 @@
-"""The page's pictures are those of our rasteriser, at rest and in motion, and its controls do what they say."""
+"""The page's images equal those of our rasteriser, at rest and in motion, and its controls work."""
 
 import base64
 import math
@@ -34,7 +34,7 @@ BACKGROUND = (0.2, 0.3, 0.4)
 
 
 def world():
-    """The two balls with harmonics of degree 3, thin Gaussians through them, and a background colour."""
+    """The two balls with harmonics of degree 3, additional thin Gaussians, and a background colour."""
     scene = two_balls_scene()
     needles = random_gaussians(300, seed=3, degree=3, size=0.02)
     scales = needles.scales * torch.tensor([4.0, 1.0, 0.2])
@@ -46,7 +46,7 @@ def world():
 
 
 def motion_of(scene, frames=3):
-    """The red ball turns and rises; the green one bends and is stretched."""
+    """The red ball rotates and rises; the green one is bent and stretched."""
     g = scene.gaussians
     rows = torch.cat([(g.object_id == o.id).nonzero()[:64, 0] for o in scene.objects])
     keypoints = Keypoints(g.means[rows], g.object_id[rows])
@@ -92,7 +92,7 @@ def psnr(a, b):
 
 
 def larger(cameras, factor=4):
-    """The same views in larger pictures."""
+    """The same views with larger images."""
     scaling = torch.tensor([[factor], [factor], [1.0]])
     return replace(cameras, Ks=cameras.Ks * scaling, sizes=cameras.sizes * factor)
 
@@ -122,7 +122,7 @@ def test_pictures_in_firefox_equal_those_of_the_rasteriser(film, open_firefox):
 
 
 def test_shadows_equal_those_of_the_rasteriser(tmp_path, open_page):
-    """Also those in the colours are lifted alike, and without the box there are none."""
+    """Shadows contained in the colours are removed alike; key K switches shadows off."""
     scene = lit_scene(spacing=0.03)
     keypoints = choose_keypoints(scene, 48)
     positions = torch.stack([moved_points(keypoints.rest, keypoints.object_id, p) for p in (REST, MOVED)])
@@ -170,7 +170,7 @@ def test_keys_play_and_show_objects(film, open_page):
         return int(((picture_of_the_page(page, cameras, 0) - red).abs().amax(-1) < 0.25).sum())
 
     everything = red_pixels()
-    page.keyboard.press("2")  # the green ball alone
+    page.keyboard.press("2")  # selects the green ball alone
     assert everything > 20 and red_pixels() == 0
     page.keyboard.press("0")
     assert red_pixels() == everything
@@ -208,7 +208,7 @@ def test_mouse_and_touch_move_the_camera(film, open_page):
         fingers = [] if spread is None else [240 - spread, 240 + spread]
         points = [{"x": x, "y": 200, "id": i} for i, x in enumerate(fingers)]
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-    until(page, f"player.camera.distance < {0.6 * nearer}")  # fingers twice as far apart
+    until(page, f"player.camera.distance < {0.6 * nearer}")  # the fingers are twice as far apart
 
 
 def test_double_click_turns_around_the_point_under_the_cursor(film, open_page):
@@ -223,7 +223,7 @@ def test_double_click_turns_around_the_point_under_the_cursor(film, open_page):
     page.mouse.dblclick(x, y)
     until(page, "player.camera.transition === null")
     _, pivot = eye_and_pivot(page)
-    assert float((pivot - green).norm()) < 0.15  # on the ball of radius 0.12, in front of its centre
+    assert float((pivot - green).norm()) < 0.15  # the point is on the ball of radius 0.12, in front of its centre
 
 
 def test_arrows_of_forces_start_at_the_object_while_they_act(tmp_path, open_page):
@@ -235,7 +235,8 @@ def test_arrows_of_forces_start_at_the_object_while_they_act(tmp_path, open_page
     page = open_page(path)
     page.evaluate("player.play(false); player.seek(0)")
     page.select_option("#view", label="00.png")
-    drawn = "(document.querySelector('#overlay path').getAttribute('d') ?? '')"  # no attribute before the first image
+    # the attribute is missing before the first image
+    drawn = "(document.querySelector('#overlay path').getAttribute('d') ?? '')"
     until(page, f"!player.changed && !player.busy && {drawn}.length > 0")
     x, y = (float(v) for v in page.evaluate(drawn).split(" ")[0].removeprefix("M").split(","))
     centre = page.evaluate(PIXEL_OF, motion.com[0, 1].tolist())

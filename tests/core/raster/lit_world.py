@@ -1,4 +1,4 @@
-"""A block and a ball on a floor under a sky and a lamp: exact irradiance by casting rays, at rest and moved."""
+"""A block and a ball on a floor, lit by a sky and a lamp: exact irradiance by ray casting, at rest and moved."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,14 @@ from stages.core.scene.scene import Scene, SceneObject
 from tests.reconstruct.raycast import arc, rays_of
 
 LIGHT = Light(0.35, 0.4, (0.48, -0.36, 0.8), 0.15, in_colours=True)
-HALF = torch.tensor([0.13, 0.1, 0.1])  # sides of the block
-RADIUS = 0.1  # of the ball
+HALF = torch.tensor([0.13, 0.1, 0.1])  # half sides of the block [m]
+RADIUS = 0.1  # radius of the ball [m]
 BACKGROUND = torch.tensor([0.5, 0.6, 0.7])
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Where the block (turned about z by an angle [rad]) and the ball are."""
+    """Positions of the block, which is rotated about z by an angle [rad], and of the ball."""
 
     block: tuple[float, float, float]
     angle: float
@@ -36,7 +36,7 @@ MOVED = Poses((-0.12, 0.05, 0.32), 0.6, (0.45, -0.3, 0.12))
 
 
 def sample_directions(light: Light, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Directions to the sky, distributed as the cosine, and to the lamp."""
+    """Directions to the sky, cosine-distributed, and directions to the lamp."""
     u, v = torch.quasirandom.SobolEngine(2).draw(count + 1)[1:].unbind(1)
     angle, radius = 2 * torch.pi * u, v.sqrt()
     disc = radius[:, None] * torch.stack([angle.cos(), angle.sin()], 1)
@@ -48,7 +48,7 @@ def sample_directions(light: Light, count: int) -> tuple[torch.Tensor, torch.Ten
 
 
 def hits(points: torch.Tensor, directions: torch.Tensor, poses: Poses) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances along rays to the block and to the ball; inf where they are missed."""
+    """Distances along rays to the block and to the ball, infinite for rays that miss them."""
     o, d = (points - torch.tensor(poses.block)) @ poses.turn, directions @ poses.turn
     one, two = (-HALF - o) / d, (HALF - o) / d
     enter, leave = torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
@@ -62,7 +62,7 @@ def hits(points: torch.Tensor, directions: torch.Tensor, poses: Poses) -> tuple[
 
 
 def floor_irradiance(xy: torch.Tensor, poses: Poses, light: Light = LIGHT, count: int = 128) -> torch.Tensor:
-    """Exact irradiance of floor points (n, 2), up to sampling."""
+    """Irradiance of floor points (n, 2), exact up to the sampling of directions."""
     points = torch.cat([xy, torch.zeros(len(xy), 1)], 1)[:, None]
     seen = []
     for directions in sample_directions(light, count):
@@ -72,7 +72,7 @@ def floor_irradiance(xy: torch.Tensor, poses: Poses, light: Light = LIGHT, count
 
 
 def texture(xy: torch.Tensor) -> torch.Tensor:
-    """Linear colour of the floor: smooth and irregular stripes."""
+    """Linear colour of the floor, with smooth and irregular stripes."""
     x, y = xy.unbind(1)
     phases = torch.stack([9 * x + 2 * torch.sin(5 * y), 7 * y - 4 * x, 11 * x + 6 * y], 1)
     return torch.tensor([0.55, 0.45, 0.35]) + 0.1 * torch.sin(phases)
@@ -107,14 +107,14 @@ def _surfels(means, colours, id: int, scales: tuple) -> Gaussians:
 
 
 def moved_points(points: torch.Tensor, ids: torch.Tensor, poses: Poses) -> torch.Tensor:
-    """Points of the objects at rest, moved to other poses."""
+    """Points given for the objects at rest, moved with the objects to other poses."""
     block = (points - torch.tensor(REST.block)) @ poses.turn.T + torch.tensor(poses.block)
     ball = points - torch.tensor(REST.ball) + torch.tensor(poses.ball)
     return torch.where((ids == 1)[:, None], block, torch.where((ids == 2)[:, None], ball, points))
 
 
 def photograph(cameras, index: int, poses: Poses, light: Light = LIGHT) -> tuple[torch.Tensor, torch.Tensor]:
-    """The true photo (h, w, 3), and the floor points (h, w, 2) of its pixels, nan where the floor is not seen."""
+    """The true photo (h, w, 3), and the floor point (h, w, 2) in each pixel, nan where no floor is visible."""
     eye, rays = rays_of(cameras, index)
     block, ball = hits(eye.expand_as(rays), rays, poses)
     t = torch.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], torch.inf)

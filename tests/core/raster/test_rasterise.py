@@ -1,4 +1,4 @@
-"""Rasterisation: analytic cases, comparison with the reference, and agreement of the devices."""
+"""Rasterisation: analytic cases, comparison with a reference, and equality across devices."""
 
 import gc
 import weakref
@@ -19,7 +19,7 @@ from tests.conftest import random_gaussians, ring
 
 devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 EYE = look_at(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(3))  # looks along -x; right is +y, up is +z
-SIZE, FOCAL = 41, 50.0  # odd: the optical axis passes through the centre of pixel (20, 20)
+SIZE, FOCAL = 41, 50.0  # an odd size, so that the optical axis passes through the centre of pixel (20, 20)
 K = intrinsics(SIZE, SIZE, FOCAL)
 
 
@@ -42,7 +42,7 @@ def leaves(gaussians: Gaussians) -> list[torch.Tensor]:
 
 
 def reference(tensors, viewmat, K, width: int, height: int):
-    """Image, mean depth and alpha in float64, every splat at every pixel."""
+    """Image, mean depth and alpha in float64, computed from all splats in every pixel."""
     splats = project_reference(pack_camera(viewmat, K, width, height, 0.01), *tensors)
     rgb, total, alpha, _ = composite_reference(splats, depth_order_reference(splats), width, height)
     return rgb, alpha, total / alpha.clamp_min(1e-10)
@@ -132,7 +132,7 @@ def test_gradients_equal_the_reference(device, degree):
 
 @pytest.mark.gpu
 def test_gsplat_agrees_on_a_large_scene():
-    """50,000 Gaussians at 448 px: images to 45 dB at least, gradients to 1e-3 of their length."""
+    """50,000 Gaussians at 448 px: images agree to at least 45 dB, gradients to 1e-3 of their length."""
     gsplat = pytest.importorskip("gsplat")
     gaussians, cameras = random_gaussians(50_000, seed=3, degree=2, size=0.02).to("cuda"), ring(1, size=448)
 
@@ -199,7 +199,7 @@ def test_gradient_descent_recovers_a_gaussian(device):
 def test_invisible_gaussians_have_no_effect(device):
     seen = random_gaussians(30, degree=1)
     hidden = random_gaussians(4, seed=1, degree=1)
-    # behind, at the camera, outside the image, nearer than NEAR
+    # behind the camera, at the camera, outside the image, and nearer than NEAR
     hidden.means[:] = torch.tensor([[5.0, 0, 0], [2.0, 0, 0], [0, 30, 0], [1.995, 0, 0]])
     both = Gaussians(*(torch.cat([getattr(seen, f), getattr(hidden, f)]) for f in vars(seen)))
     tensors = leaves(both.to(device))
@@ -230,12 +230,12 @@ def test_features_are_composited_like_colours(device, count):
         grey = colours[:, channel : channel + 1].detach().expand(-1, 3)
         shot = rasterise(replace(gaussians, sh=rgb_to_sh(grey)), cameras.viewmats, cameras.Ks, 48, 40)
         torch.testing.assert_close(image[..., channel].detach(), shot.rgb[..., 0], rtol=0, atol=1e-5)
-    with torch.no_grad():  # bins where four features are all zero are left out
+    with torch.no_grad():  # bins in which four features are all zero are skipped
         few = colours * (torch.arange(200) < 5)[:, None].to(device)
         shown = rasterise_features(gaussians, few, cameras.viewmats, cameras.Ks, 48, 40)
     all_bins = rasterise_features(gaussians, few.requires_grad_(), cameras.viewmats, cameras.Ks, 48, 40)
     assert torch.equal(shown, all_bins) and (shown > 0).any() and (shown == 0).any()
-    # the derivative by a feature is the Gaussian's total weight
+    # the derivative with respect to a feature is the total weight of the Gaussian
     (grad,) = torch.autograd.grad(image.sum(), colours)
     weights = sum(visibility(gaussians, V, K, 48, 40).weight for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))
     torch.testing.assert_close(grad[:, -1], weights, rtol=1e-3, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Shadows of spheres: against cast rays, their limits, and what is left of the shadows in the colours."""
+"""Shadows of spheres: comparison with ray casting, limits, and shadows that the colours contain."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ HIGH = Light(0.5, 0.5, (0.6, 0.0, 0.8), 0.2, in_colours=True)
 
 
 def test_a_sphere_blocks_what_cast_rays_say():
-    """Exact for the sky; the lamp's overlap of discs is approximated (Oat and Sander)."""
+    """Exact for the sky; for the lamp, the overlap of discs is approximated (Oat and Sander)."""
     ball = replace(BALL, radii=torch.tensor([RADIUS]))
     away = replace(REST, block=(50.0, 0.0, 0.1), ball=(0.0, 0.0, 0.3))
     line = torch.linspace(-0.5, 0.5, 41)
@@ -25,7 +25,7 @@ def test_a_sphere_blocks_what_cast_rays_say():
     sky, lamp = blocked(points, torch.zeros(41, dtype=torch.int64), ball, HIGH)
     true_sky = 1 - floor_irradiance(xy, away, replace(HIGH, sky=1.0, lamp=0.0), count=4096)
     true_lamp = 1 - floor_irradiance(xy, away, replace(HIGH, sky=0.0, lamp=1.0), count=4096)
-    assert float((sky - true_sky).abs().max()) < 0.012  # blocked fractions below 0.01 are left out
+    assert float((sky - true_sky).abs().max()) < 0.012  # blocked fractions below 0.01 are omitted
     error = (lamp - true_lamp).abs()
     assert float(error.max()) < 0.15 and float(error.mean()) < 0.03
     assert true_lamp.max() > 0.9 and true_sky.max() > 0.1
@@ -51,7 +51,8 @@ def test_factor_is_one_where_nothing_changed_and_lifts_at_most_what_the_colours_
     for light in (HIGH, OVERHEAD, replace(HIGH, beneath=0.3)):
         assert torch.equal(shadow_factor(rest, rest, light), torch.ones(3))
     one = torch.ones(3)
-    torch.testing.assert_close(shadow_factor(one, rest, HIGH), one)  # colours beneath were filled in: not dark
+    # the colours beneath were filled in and are not dark
+    torch.testing.assert_close(shadow_factor(one, rest, HIGH), one)
     dark = shadow_factor(one, rest, replace(HIGH, beneath=0.5)) ** GAMMA
     torch.testing.assert_close(dark, torch.tensor([2.0, 1 / 0.6, 1.0]))
     torch.testing.assert_close(shadow_factor(0.5 * rest, rest, HIGH) ** GAMMA, 0.5 * one)

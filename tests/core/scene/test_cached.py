@@ -1,4 +1,4 @@
-"""Results that are computed once for each scene."""
+"""Results that are computed once per scene."""
 
 import pickle
 from dataclasses import replace
@@ -27,5 +27,5 @@ def test_a_scene_goes_to_another_process_without_its_results():
         return len(scene.objects)
 
     scene = two_balls_scene()
-    assert objects(scene) == 2  # held under a function that cannot be pickled
+    assert objects(scene) == 2  # cached under a function that cannot be pickled
     assert "_cached" in scene.__dict__ and not pickle.loads(pickle.dumps(scene)).__dict__["_cached"]

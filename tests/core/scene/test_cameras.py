@@ -20,12 +20,12 @@ from stages.core.scene.cameras import (
 )
 from tests.conftest import ring
 
-POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]  # 3 from the origin, looking at it
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]  # at a distance of 3 from the origin, facing it
 LENS = {"k1": -0.25, "k2": 0.04, "p1": 0.001, "p2": -0.002, "k3": 0.01}
 
 
 def with_photos(cameras: Cameras) -> Cameras:
-    """Cameras that remember photos of twice the size, with another lens each."""
+    """Cameras that store photos of twice the size, each with different lens distortion."""
     c = len(cameras)
     lens = torch.tensor([-0.25, 0.04, 0.001, -0.002, 0.01]) * torch.arange(1, c + 1)[:, None]
     return dataclasses.replace(cameras, photos=PhotoIntrinsics(resize(cameras.Ks, 2.1, 2.1), 2 * cameras.sizes, lens))
@@ -39,7 +39,7 @@ def write_transforms(folder, **more):
 
 
 def write_colmap(folder, model: str, params: list[float], text: bool = False):
-    """A COLMAP model of two photos with this camera model and these parameters, as COLMAP writes it."""
+    """Let pycolmap write a model of two photos with a camera of this model and parameters."""
     pycolmap = pytest.importorskip("pycolmap")
 
     reconstruction = pycolmap.Reconstruction()
@@ -127,7 +127,7 @@ def test_wrong_camera_fields_are_refused(field, value):
 
 
 def test_transforms_json_has_opengl_axes(tmp_path):
-    # An OpenGL camera at (0, 0, 3) without rotation looks along -z: the origin is 3 ahead, and y is up.
+    # An OpenGL camera at (0, 0, 3) without rotation faces -z: the origin is 3 in front of it, and y is up.
     cameras, lenses = read_cameras(write_transforms(tmp_path))
     assert cameras.names == ("a.jpg", "b.jpg")
     assert (cameras.viewmats[0] @ torch.tensor([0.0, 1, 0, 1])).tolist() == [0, -1, 3, 1]
@@ -154,7 +154,7 @@ def test_colmap_poses_are_those_that_colmap_reads(tmp_path, text):
     pycolmap = pytest.importorskip("pycolmap")
     path = write_colmap(tmp_path, "PINHOLE", [50, 51, 32, 24], text)
     images = sorted(pycolmap.Reconstruction(str(path)).images.values(), key=lambda image: image.name)
-    (path / f"points3D.{'txt' if text else 'bin'}").write_bytes(b"\xff" * 20)  # damaged points do not matter
+    (path / f"points3D.{'txt' if text else 'bin'}").write_bytes(b"\xff" * 20)  # a damaged file of points has no effect
     poses = np.array([image.cam_from_world().matrix() for image in images])
     torch.testing.assert_close(read_cameras(path)[0].viewmats[:, :3], torch.from_numpy(poses).float())
 

@@ -1,4 +1,4 @@
-"""COLMAP models as bytes and text written here, by the layout that COLMAP documents."""
+"""COLMAP models, written here as bytes and text in the layout documented by COLMAP."""
 
 import struct
 from contextlib import nullcontext
@@ -11,7 +11,7 @@ from stages.core.scene import colmap_model
 from stages.core.scene.cameras import read_cameras
 from stages.core.scene.colmap_model import read_colmap
 
-POSE = (0.5, 0.5, 0.5, 0.5, 1.0, 2.0, 3.0)  # x to y, y to z, z to x
+POSE = (0.5, 0.5, 0.5, 0.5, 1.0, 2.0, 3.0)  # maps x to y, y to z, z to x
 CAMERAS = "# a comment\n1 PINHOLE 64 48 50 51 32 24\n\n7 SIMPLE_RADIAL 8 6 5 4 3 0.1\n"
 IMAGES = "# two lines for each\n1 0.5 0.5 0.5 0.5 1 2 3 1 some folder/b b.jpg\n1 2 -1\n2 2 0 0 0 0 0 0 7 a.jpg\n\n"
 
@@ -36,11 +36,11 @@ def write(folder, cameras, images, suffix):
 
 def test_text_is_read_with_its_comments_and_empty_lines(tmp_path):
     first, second = read_colmap(write(tmp_path, CAMERAS, IMAGES, "txt"))
-    assert (first.name, second.name) == ("a.jpg", "b b.jpg")  # without folders; a name may have spaces
+    assert (first.name, second.name) == ("a.jpg", "b b.jpg")  # folders are removed; a name may have spaces
     assert first.size == (8, 6) and first.K.tolist() == [[5, 0, 4], [0, 5, 3], [0, 0, 1]]
     assert first.lens == (0.1, 0, 0, 0, 0, 0, 0, 0) and not any(second.lens)
     assert second.size == (64, 48) and second.K.tolist() == [[50, 0, 32], [0, 51, 24], [0, 0, 1]]
-    np.testing.assert_allclose(first.viewmat, np.eye(4))  # the quaternion of length 2 is normalised
+    np.testing.assert_allclose(first.viewmat, np.eye(4))  # a quaternion of length 2 is normalised
     np.testing.assert_allclose(second.viewmat, [[0, 0, 1, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]], atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Files that are replaced when complete."""
+"""Files that are replaced only when the new one is complete."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ def test_two_writers_of_one_file_do_not_mix(tmp_path):
         with replacing(out) as second:
             second.write_text("second")
         assert out.read_text() == "second"
-    assert out.read_text() == "first"  # the last one to finish
+    assert out.read_text() == "first"  # it finished last
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
@@ -110,7 +110,7 @@ def test_provenance_names_inputs_with_their_hashes_and_options_as_text(tmp_path)
         (tmp_path / name).write_bytes(b"abc")
     facts = files.provenance("ngff x", [tmp_path / "a.txt", tmp_path], {"weights": tmp_path / "b.txt", "steps": 3})
     assert facts["command"] == "ngff x" and facts["options"] == {"weights": str(tmp_path / "b.txt"), "steps": 3}
-    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of FIPS 180-2, B.1
+    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # from FIPS 180-2, B.1
     again = {"name": "b.txt", "sha256": digest}
     assert facts["inputs"] == [{"name": "a.txt", "sha256": digest}, {"name": tmp_path.name}, again]
     assert files.provenance("x", [])["options"] == {} and facts["ngff"] == files.ngff_version()
@@ -126,13 +126,13 @@ def test_what_must_exist_is_a_readable_file(tmp_path, monkeypatch):
             must_exist(tmp_path / name, "a toy")
     (tmp_path / "empty").write_text("x")
     assert must_exist(tmp_path / "empty", "a toy") == tmp_path / "empty"
-    monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # file permissions do not hold for root
+    monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # file permissions do not apply to root
     with pytest.raises(InputError, match="empty: cannot be read; check its permissions"):
         must_exist(tmp_path / "empty", "a toy")
 
 
 def test_an_interrupt_waits_until_hdf5_has_written(tmp_path, monkeypatch):
-    """HDF5 loses exceptions of the file object that it calls."""
+    """The reason is that HDF5 loses exceptions raised in the file object that it calls."""
 
     def interrupted(data):
         interrupt(signal.SIGINT, sys._getframe())

@@ -1,4 +1,4 @@
-"""Datasets that are compressed here can be read by HDF5, and the reverse."""
+"""Datasets compressed by our code can be read by HDF5, and vice versa."""
 
 import zlib
 
@@ -17,7 +17,7 @@ from stages.core.scene.h5_chunks import (
     write_compressed,
 )
 
-COUNT = CHUNK_BYTES // 12 + 1000  # rows of three floats: two chunks, the second one not full
+COUNT = CHUNK_BYTES // 12 + 1000  # rows of three floats in two chunks, the second one incomplete
 ARRAYS = {
     "floats": np.random.default_rng(0).normal(size=(COUNT, 3)).astype("f4"),
     "harmonics": np.random.default_rng(1).normal(size=(COUNT // 3, 4, 3)).astype("f4"),
@@ -45,7 +45,7 @@ def test_both_ways_agree_with_hdf5(tmp_path, name):
             assert np.array_equal(read_compressed(data), values)
             for row in {0, len(values) // 2, len(values) - 1} if len(values) and values.ndim > 1 else ():
                 assert np.array_equal(read_compressed(data, row), values[row])
-        if values.nbytes > CHUNK_BYTES:  # several threads encode several chunks
+        if values.nbytes > CHUNK_BYTES:  # several chunks are encoded by several threads
             rows = file["ours"].chunks[0]
             assert file["ours"].chunks[1:] == values.shape[1:] and rows == CHUNK_BYTES // values[0].nbytes
         assert file["ours"].id.get_storage_size() < 1.1 * file["theirs"].id.get_storage_size() + 100
@@ -90,7 +90,7 @@ def test_chunks_without_some_of_the_filters(tmp_path):
 ])  # fmt: skip
 @pytest.mark.parametrize("dtype", ["f4", "S4"])
 def test_a_chunk_that_unpacks_to_more_than_its_values_is_refused(tmp_path, filters, dtype):
-    """HDF5 unpacks all of it: 1 MB in a file are 1 GB."""
+    """HDF5 would unpack all of it: 1 MB in a file can become 1 GB."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         data = file.create_dataset("rows", (4, 3), dtype, chunks=(4, 3), **filters)
         data.id.write_direct_chunk((0, 0), zlib.compress(bytes(1 << 24)))

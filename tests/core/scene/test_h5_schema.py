@@ -1,4 +1,4 @@
-"""Datasets of HDF5 are checked against their shape, type and range before they are read."""
+"""The shape, type and range of HDF5 datasets are checked before they are read."""
 
 import h5py
 import numpy as np
@@ -44,7 +44,7 @@ def test_types_are_those_of_the_kind(file, kind, accepted):
             with pytest.raises(ValueError, match=f"values of type .*not {kind}"):
                 Dataset("n", kind).read(file, letter, {})
     file["text"], file["bytes"] = ["duck", "ü"], np.array([b"ab", b"c"])
-    file.flush()  # texts are looked up in the bytes on the disk
+    file.flush()  # texts are read from the bytes on the disk
     for name, texts in (("text", ["duck", "ü"]), ("bytes", ["ab", "c"])):
         if kind == "text":
             assert Dataset("n", kind).read(file, name, {}) == texts
@@ -79,7 +79,7 @@ def test_what_is_no_dataset_with_values_of_its_own_is_refused(file, tmp_path):
 
 
 def test_more_values_than_the_file_can_store_are_refused(file, monkeypatch):
-    """Deflate makes at most 1032 bytes of one; a dataset without any bytes is not more than 4096 large."""
+    """Deflate expands a byte to at most 1032 bytes; a dataset without stored bytes is limited to 4096 bytes."""
     file.create_dataset("small", (1024,), "f4")
     file.create_dataset("large", (1025,), "f4")
     file.create_dataset("zeros", data=np.zeros(10**6, "f4"), compression="gzip", chunks=(10**6,))
@@ -111,7 +111,7 @@ def start_of(units: FieldUnits, objects: int = 2, points: int = 5) -> FieldStart
 def test_the_start_of_a_field_is_read_back(file, friction):
     assert read_field_start(file, {}) is None
     units = FieldUnits(**{**UNITS.__dict__, "friction": friction})
-    for objects in (3, 2):  # the second replaces the first
+    for objects in (3, 2):  # the second one replaces the first one
         start = start_of(units, objects)
         write_field_start(file, start)
     file.flush()
@@ -137,7 +137,7 @@ def test_units_of_a_field_out_of_range_are_refused(file, name, value):
 
 @pytest.mark.parametrize("name", [name for name, dataset in DATASETS.items() if dataset.kind != "text"])
 def test_values_of_a_field_out_of_range_are_refused(file, name):
-    """No mass, stiffness or friction is negative, and materials are elastic: nu is between -1 and 0.5."""
+    """Mass, stiffness and friction are not negative, and nu is between -1 and 0.5, as for elastic materials."""
     low = {"solidity": 1, "nu": -1, **dict.fromkeys(("points", "velocity", "inertia", "box"), -1e9)}.get(name, 0)
     high = {"mass_fraction": 1.001, "nu": 0.5, "awake": 1, "standing": 1,
             **dict.fromkeys(("mass", "volume", "E", "solidity"), 1e30)}.get(name, 1e9)  # fmt: skip
@@ -174,11 +174,12 @@ def test_a_file_is_opened_for_reading(tmp_path):
 
 
 def test_a_damaged_fill_value_is_refused(tmp_path):
-    """HDF5 crashes where it is asked for a fill value of a negative size."""
+    """HDF5 crashes when it reads a fill value of negative size."""
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         write_compressed(file, "points", np.ones((7, 3), np.float32))
-    message = bytes([5, 0, 8, 0, 1, 0, 0, 0, 2, 3, 2, 1])  # type 5, 8 bytes: version, times, whether defined
+    # type 5 (fill value), 8 bytes: version, times, whether it is defined
+    message = bytes([5, 0, 8, 0, 1, 0, 0, 0, 2, 3, 2, 1])
     data = bytearray(path.read_bytes())
     size = data.index(message) + len(message)
     data[size + 3] = 0x9D

@@ -1,4 +1,4 @@
-"""Texts of variable length are read as HDF5 reads them; damaged ones are refused before HDF5 takes memory for them."""
+"""Texts of variable length are read as by HDF5; damaged ones are refused before HDF5 allocates memory for them."""
 
 import struct
 import zlib
@@ -16,13 +16,13 @@ STORED = [{}, {"chunks": (2,)}, {"chunks": (2,), "maxshape": (None,)}, {"compres
 
 
 def write(path, libver="earliest", **stored):
-    """A file with texts in a dataset and in many attributes, in headers of the old or of the new version.
+    """Write texts to a dataset and to many attributes, with headers of the old or the new version.
 
-    Those of "tracked" also have the order in which attributes were made.
+    "tracked" also stores the order in which the attributes were created.
     """
     tracked = libver == "tracked"
     with h5py.File(path, "w", libver="latest" if tracked else libver, track_order=tracked) as file:
-        for i in range(6):  # more do not stay in a header of the new version
+        for i in range(6):  # more would not fit into a header of the new version
             file.attrs[f"{i}"] = "attribute " + i * "z"
         file.attrs["matrix"], file.attrs["list"] = np.eye(3), ["a", "bc", ""]
         file.create_dataset("names", data=NAMES, dtype=h5py.string_dtype(), **stored)
@@ -59,7 +59,7 @@ def test_texts_of_other_filters_and_files_within_others_are_refused(tmp_path):
 
 
 def test_compressed_texts_of_another_length_are_refused(tmp_path):
-    """The chunk of 5 references, of which 4 are stored."""
+    """A chunk of 5 references, 4 of which are stored."""
     write(tmp_path / "a.h5", compression="gzip")
     with h5py.File(tmp_path / "a.h5", "a") as file:
         names = file["names"]
@@ -98,7 +98,7 @@ def test_a_text_longer_than_its_heap_has_is_refused(tmp_path, libver, length):
     for at in places:
         path.write_bytes(data)
         with h5py.File(path) as file:
-            names = file["names"]  # from here on the sums of the new version's headers have been checked
+            names = file["names"]  # the checksums of headers of the new version have been verified here
             path.write_bytes(data[:at] + struct.pack("<I", 3 << 30) + data[at + 4 :])
             with pytest.raises(ValueError, match="a text of 3221225472 bytes is not in the file"):
                 check_attributes(file)
@@ -141,7 +141,7 @@ def test_a_damaged_heap_is_refused(tmp_path, offset, value):
 
 
 def test_free_space_of_no_length_in_a_heap_is_refused(tmp_path):
-    """HDF5 2.0 would read it for ever."""
+    """HDF5 2.0 would read it in an infinite loop."""
     path = tmp_path / "a.h5"
     write(path)
     data = path.read_bytes()
@@ -170,7 +170,7 @@ def test_a_header_that_continues_in_itself_or_outside_the_file_is_refused(tmp_pa
 
 @pytest.mark.parametrize("options", [{}, {"compression": "gzip"}, {"compression": "lzf"}])
 def test_a_chunk_of_gigabytes_is_refused(tmp_path, options):
-    side = (64 << 20) // 4 + 1  # floats of 64 MiB, and one more
+    side = (64 << 20) // 4 + 1  # 64 MiB of floats, and one more
     with h5py.File(tmp_path / "a.h5", "w") as file:
         properties = {"maxshape": (None,), "chunks": (side,), **options}
         file.create_dataset("x", (3,), "f4", **properties)

@@ -1,4 +1,4 @@
-"""Sizes in headers agree with the decoder's, and what a file cannot hold is refused before it is decoded."""
+"""Sizes in image headers equal those of the decoder, and impossible sizes are refused before decoding."""
 
 import io
 import struct
@@ -18,7 +18,7 @@ FORMATS = {
     ".webp": [cv2.IMWRITE_WEBP_QUALITY, 80], ".tif": [cv2.IMWRITE_TIFF_COMPRESSION, 1],
     ".tiff": [cv2.IMWRITE_TIFF_COMPRESSION, 5],
 }  # fmt: skip
-DEEP = (".png", ".tif", ".tiff")  # those that hold 16 bits
+DEEP = (".png", ".tif", ".tiff")  # formats that can have 16 bits
 
 
 def encode(suffix, pixels):
@@ -130,7 +130,7 @@ def test_files_of_other_kinds_and_of_any_length_are_refused(tmp_path, monkeypatc
 
 
 def tiff(order: str, tags: dict[int, tuple[int, int]]) -> bytes:
-    """The header of a TIFF file with these tags: kind (3: 16 bits, 4: 32 bits) and value."""
+    """The header of a TIFF file with these tags, given by kind (3: 16 bits, 4: 32 bits) and value."""
     entries = b"".join(struct.pack(order + ("HHIHxx" if kind == 3 else "HHII"), tag, kind, 1, value)
                        for tag, (kind, value) in tags.items())  # fmt: skip
     name = b"II*\0" if order == "<" else b"MM\0*"
@@ -154,7 +154,7 @@ def test_sizes_of_tiff_files_are_those_of_the_tags_or_of_a_larger_tile(order):
 
 
 def test_sizes_of_bmp_files_of_both_kinds():
-    """Rows from the top down have a negative height; the older kind has 16 bits for each side."""
+    """A negative height means rows from top to bottom; the older kind has 16 bits per side."""
     new = b"BM" + bytes(12) + struct.pack("<IiiHH", 40, 300, -37, 1, 24)
     assert read_image_header(new) == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
     old = b"BM" + bytes(12) + struct.pack("<IHHHH", 12, 40_000, 37, 1, 8)
@@ -163,10 +163,10 @@ def test_sizes_of_bmp_files_of_both_kinds():
 
 @pytest.mark.parametrize("marker", [0xC4, 0xC8, 0xCC, 0xDB, 0xFE])
 def test_segments_of_a_jpeg_before_its_frame_are_skipped(marker):
-    """Also those whose markers are among the ones that begin frames; the file may end after the number of channels."""
+    """Includes segments whose markers resemble those of frames; the file may end after the number of channels."""
     frame = b"\xff\xc2" + struct.pack(">HBHHB", 8, 8, 37, 300, 3)
     between = bytes([0xFF, marker]) + struct.pack(">H", 12) + b"\xff\xc0" * 5
-    alone = b"\xff\xff\x01\xff\xd0\xff\xd7"  # filling, and markers without a length
+    alone = b"\xff\xff\x01\xff\xd0\xff\xd7"  # fill bytes, and markers without a length
     data = b"\xff\xd8" + between + alone + frame
     assert read_image_header(data) == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
     with pytest.raises(ValueError, match="no image"):
@@ -174,7 +174,7 @@ def test_segments_of_a_jpeg_before_its_frame_are_skipped(marker):
 
 
 def test_bound_of_a_png_is_that_of_deflate():
-    """In 16 bits, with all channels of each colour type."""
+    """The tested images have 16 bits and all channels of each colour type."""
     for kind, channels in ((0, 1), (2, 3), (3, 1), (4, 2), (6, 4)):
         body = b"IHDR" + struct.pack(">IIBBBBB", 300, 37, 16, kind, 0, 0, 0)
         data = (

@@ -71,12 +71,12 @@ def test_video_is_h264_with_leading_index(tmp_path):
     shades = [0.2, 0.5, 0.8]
     with VideoWriter(path, fps=50.0) as video:
         for shade in shades:
-            video.append(torch.full((33, 48, 3), shade))  # an odd height loses a row
+            video.append(torch.full((33, 48, 3), shade))  # the last row of an odd height is removed
     with pytest.importorskip("av").open(str(path)) as file:
         stream = file.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 50)
     data = path.read_bytes()
-    assert data.find(b"moov") < data.find(b"mdat")  # fast start: the index comes first
+    assert data.find(b"moov") < data.find(b"mdat")  # the index comes first, so that playback can start early
     frames = list(read_video(path))
     assert [f.shape for f in frames] == [(32, 48, 3)] * 3
     torch.testing.assert_close(torch.tensor([float(f.mean()) for f in frames]), torch.tensor(shades), atol=0.02, rtol=0)
@@ -85,12 +85,13 @@ def test_video_is_h264_with_leading_index(tmp_path):
 def test_frames_of_films_that_phones_turned_are_upright(tmp_path):
     path = tmp_path / "v.mp4"
     image = torch.zeros(32, 64, 3)
-    image[:, :16] = 1.0  # left
+    image[:, :16] = 1.0  # the left part is white
     with VideoWriter(path, fps=50.0) as video:
         video.append(image)
     data, one = path.read_bytes(), 1 << 16
-    at = data.find(struct.pack(">4i", one, 0, 0, 0), data.find(b"tkhd"))  # matrix of the track, 9 numbers
-    path.write_bytes(data[:at] + struct.pack(">5i", 0, one, 0, -one, 0) + data[at + 20 :])  # by 90 degrees clockwise
+    at = data.find(struct.pack(">4i", one, 0, 0, 0), data.find(b"tkhd"))  # the matrix of the track has 9 numbers
+    # rotation by 90 degrees clockwise
+    path.write_bytes(data[:at] + struct.pack(">5i", 0, one, 0, -one, 0) + data[at + 20 :])
     frame = next(read_video(path))
     assert frame.shape == (64, 32, 3) and float(frame[:12].mean()) > 0.9 and float(frame[20:].mean()) < 0.1
 
@@ -116,7 +117,7 @@ def test_image_with_too_many_pixels_is_refused(tmp_path, reader):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="open files are listed in /proc")
 def test_refused_videos_are_closed(tmp_path, monkeypatch):
-    """Sound alone, and frames of too many pixels; the errors are kept, and no file stays open with them."""
+    """Sound without video, and frames of too many pixels. The stored errors must not keep files open."""
     pytest.importorskip("av")
     with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
         sound.setparams((1, 2, 8000, 0, "NONE", None))
@@ -170,7 +171,7 @@ def test_images_are_shrunk_by_areas_and_enlarged_bilinearly():
 
 def test_jpegs_have_the_channels_and_the_quality_asked_for(tmp_path):
     image = torch.zeros(16, 16, 3)
-    image[..., 0], image[..., 2] = 1.5, 0.25  # clamped
+    image[..., 0], image[..., 2] = 1.5, 0.25  # values above 1 are clamped
     write_jpeg(tmp_path / "a.jpg", image)
     expected = torch.tensor([1.0, 0.0, 0.25]).expand(16, 16, 3)
     torch.testing.assert_close(read_image(tmp_path / "a.jpg"), expected, atol=0.02, rtol=0)
@@ -191,7 +192,7 @@ def test_label_images_have_one_channel_and_a_bounded_depth(tmp_path):
 
 
 def png(depth: int, row: bytes, width: int, palette: bytes | None = None) -> bytes:
-    """A PNG of one row of packed pixels, grey or with a palette and the opacity of its first colour."""
+    """A PNG with one row of packed pixels, grey, or with a palette whose first colour is transparent."""
     parts = [(b"IHDR", struct.pack(">IIBBBBB", width, 1, depth, 0 if palette is None else 3, 0, 0, 0))]
     parts += [] if palette is None else [(b"PLTE", palette), (b"tRNS", b"\0")]
     parts += [(b"IDAT", zlib.compress(b"\0" + row)), (b"IEND", b"")]
@@ -205,7 +206,7 @@ def png(depth: int, row: bytes, width: int, palette: bytes | None = None) -> byt
     (8, b"\x00\x01\x02\x03", [0, 1, 2, 3]),
 ])  # fmt: skip
 def test_label_images_of_few_bits_or_with_a_palette_hold_their_numbers(tmp_path, depth, row, expected):
-    """Decoders spread the numbers of few bits over 0 to 255, and show the colours of a palette."""
+    """Decoders would scale numbers of few bits to 0 to 255, and return the colours of a palette."""
     (tmp_path / "grey.png").write_bytes(png(depth, row, 4))
     assert read_labels(tmp_path / "grey.png").tolist() == [expected]
     (tmp_path / "palette.png").write_bytes(png(depth, row, 4, bytes([0, 0, 0, 200, 0, 0, 0, 200, 0] * 7)[: 3 << depth]))
@@ -221,7 +222,7 @@ def test_label_images_whose_palette_is_of_other_greys_are_ambiguous(tmp_path):
 def test_label_images_are_not_compressed_with_losses(tmp_path):
     labels = np.kron(np.array([[0, 1], [2, 3]], np.uint8), np.ones((20, 20), np.uint8))
     cv2.imwrite(str(tmp_path / "a.jpg"), labels)
-    (tmp_path / "a.jpg").rename(tmp_path / "a.png")  # what it is called does not matter
+    (tmp_path / "a.jpg").rename(tmp_path / "a.png")  # the file name has no effect
     with pytest.raises(InputError, match="a.png: is a JPEG, .* as PNG"):
         read_labels(tmp_path / "a.png")
 
@@ -266,7 +267,7 @@ def test_frames_are_sampled_evenly_with_both_ends(tmp_path):
 
 
 def test_a_film_of_another_number_of_frames_than_it_states(tmp_path, monkeypatch):
-    """The container counts 9 or none; of these 9 both ends are taken, of none none."""
+    """The container states 0, 5 or 30 frames; three of the actual 9 are sampled. Without any frame it is refused."""
     pytest.importorskip("av")
     with VideoWriter(tmp_path / "v.mp4", fps=10.0) as video:
         for n in range(9):

@@ -1,4 +1,4 @@
-"""From photos as taken to undistorted views: images, label images, points and boxes, against OpenCV and by hand."""
+"""Conversion of photos to undistorted views: images, label images, points and boxes, compared with OpenCV."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ LENSES = {"barrel": [-0.25, 0, 0, 0, 0], "all": [-0.2, 0.05, 0.01, -0.008, 0.002
 
 
 def camera(distortion: list[float], size: tuple[int, int] = SIZE) -> Cameras:
-    """One camera: the photo has `size`, K with an off-centre principal point, and the lens; the view is smaller."""
+    """One camera with a distorted photo of `size` and an off-centre principal point; its view is smaller."""
     K = torch.tensor([[260.0, 0, 165], [0, 255, 118], [0, 0, 1]])
     K = K * torch.tensor([[size[0] / SIZE[0]], [size[1] / SIZE[1]], [1.0]])
     view_K = intrinsics(160, 120, 125.0)
@@ -26,7 +26,7 @@ def camera(distortion: list[float], size: tuple[int, int] = SIZE) -> Cameras:
 
 
 def scene_labels(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Labels of a wall at z = 1: a disc in the centre, a box in a corner, a bar along the bottom."""
+    """Labels of a wall at z = 1 with a disc in the centre, a box in a corner and a bar along the bottom."""
     out = np.zeros(x.shape, np.int64)
     out[(x - 0.05) ** 2 + y**2 < 0.15**2] = 1
     out[(x > 0.35) & (x < 0.55) & (y < -0.2) & (y > -0.42)] = 2
@@ -35,17 +35,17 @@ def scene_labels(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def grid(width: int, height: int) -> np.ndarray:
-    """Pixel centres (h, w, 2), at +0.5."""
+    """Pixel centres (h, w, 2), which have an offset of 0.5."""
     return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
 
 
 def photographed(cameras: Cameras, size: tuple[int, int]) -> torch.Tensor:
-    """The label image of the photo as taken, at any size, with directions by OpenCV."""
+    """The label image of the distorted photo at any size, with directions computed by OpenCV."""
     factor = torch.tensor(size) / cameras.photos.sizes[0]
     K = (cameras.photos.Ks[0] * torch.cat([factor, torch.ones(1)])[:, None]).double().numpy()
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-    at = grid(*size).reshape(-1, 1, 2)  # both the pixels and K have centres at +0.5
-    invert = getattr(cv2, "undistortPointsIter", None)  # OpenCV 4
+    at = grid(*size).reshape(-1, 1, 2)  # pixel centres and K both have the offset of 0.5
+    invert = getattr(cv2, "undistortPointsIter", None)  # exists in OpenCV 4
     lens = cameras.photos.distortion[0].double().numpy()
     xy = invert(at, K, lens, None, None, criteria) if invert else cv2.undistortPoints(at, K, lens, criteria=criteria)
     xy = xy.reshape(size[1], size[0], 2)
@@ -53,7 +53,7 @@ def photographed(cameras: Cameras, size: tuple[int, int]) -> torch.Tensor:
 
 
 def viewed(cameras: Cameras) -> torch.Tensor:
-    """The true label image of the view."""
+    """The true label image of the undistorted view."""
     K = cameras.Ks[0].numpy()
     xy = (grid(*cameras.sizes[0].tolist()) - K[:2, 2]) / K[[0, 1], [0, 1]]
     return torch.from_numpy(scene_labels(xy[..., 0], xy[..., 1]))
@@ -84,7 +84,7 @@ def test_image_and_labels_agree():
 
 
 def test_beyond_the_edges_of_a_photo_its_outermost_pixels_continue():
-    """The lens bends the edges inwards, so that the corners of the view are not on the photo."""
+    """The lens bends the edges inwards, so that the corners of the view are outside the photo."""
     image = torch.full((240, 320, 3), 0.75)
     image[:, :160] = 0.25
     lens = Undistortion.of(camera([0.25, 0, 0, 0, 0]), 0, SIZE)
@@ -103,7 +103,7 @@ def test_photos_larger_than_the_view_keep_their_resolution():
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_points_agree_with_opencv(lens):
     cameras = camera(lens)
-    seen = torch.tensor([[20.0, 15], [80, 60], [150.5, 100.25]])  # in the view
+    seen = torch.tensor([[20.0, 15], [80, 60], [150.5, 100.25]])  # points in the view [px]
     K, view_K = cameras.photos.Ks[0].double().numpy(), cameras.Ks[0].double().numpy()
     rays = np.pad((seen.numpy() - view_K[:2, 2]) / view_K[[0, 1], [0, 1]], ((0, 0), (0, 1)), constant_values=1.0)
     taken, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(lens))
@@ -112,18 +112,19 @@ def test_points_agree_with_opencv(lens):
 
 
 def test_points_beyond_what_the_lens_shows_are_nan():
-    # r (1 - r^2 / 4) is 0.77 at most: no direction is seen at 1.2 focal lengths from the centre.
+    # r (1 - r^2 / 4) is at most 0.77, so no direction is seen 1.2 focal lengths from the centre
     lens = Undistortion.of(camera(LENSES["barrel"]), 0, SIZE)
     beyond = torch.tensor([[165 + 1.2 * 260, 118.0], [165 - 1.2 * 260, 118.0], [165, 118 + 1.2 * 255]])
     assert lens.points(beyond).isnan().all()
 
 
 def test_a_box_beyond_what_the_lens_shows_is_that_of_the_rest():
-    cameras = camera([-1.0, 0, 0, 0, 0])  # r (1 - r^2) is 0.385 at most
+    cameras = camera([-1.0, 0, 0, 0, 0])  # r (1 - r^2) is at most 0.385
     lens = Undistortion.of(cameras, 0, SIZE)
     box = lens.boxes(torch.tensor([[165.0, 118.0, 320.0, 119.0]]))[0]
-    torch.testing.assert_close(box[:2], torch.tensor([80.0, 60.0]), rtol=0, atol=1e-3)  # the principal point
-    assert 100 < box[2] < 80 + 0.58 * 125 and box.isfinite().all()  # r is below 1 / sqrt 3
+    # the principal point of the view
+    torch.testing.assert_close(box[:2], torch.tensor([80.0, 60.0]), rtol=0, atol=1e-3)
+    assert 100 < box[2] < 80 + 0.58 * 125 and box.isfinite().all()  # r is less than 1 / sqrt 3
 
 
 def test_the_map_of_a_photo_without_distortion_is_that_of_its_pinhole():
@@ -139,11 +140,11 @@ def test_box_contains_the_edges_that_the_lens_bends():
     lens = Undistortion.of(cameras, 0, SIZE)
     box, corners = torch.tensor([[60.0, 40, 270, 200]]), torch.tensor([[60.0, 40], [60, 200], [270, 40], [270, 200]])
     middle = torch.tensor([[60.0, 118], [270, 118]])
-    # a barrel lens is undone by moving points outwards, the corners most: they determine the box
+    # the correction of a barrel lens moves points outwards, the corners most, so they determine the box
     found, ends = lens.boxes(box)[0], lens.points(corners)
     torch.testing.assert_close(found, torch.cat([ends.amin(0), ends.amax(0)]))
     assert found[0] < lens.points(middle)[0, 0] - 1
-    # a pincushion lens by moving them inwards: the middles of the edges determine it
+    # the correction of a pincushion lens moves them inwards, so the middles of the edges determine the box
     lens = Undistortion.of(camera([0.25, 0, 0, 0, 0]), 0, SIZE)
     found = lens.boxes(box)[0]
     torch.testing.assert_close(found[[0, 2]], lens.points(middle)[:, 0], rtol=0, atol=0.1)
@@ -153,7 +154,7 @@ def test_box_contains_the_edges_that_the_lens_bends():
 def test_boxes_without_a_lens_are_scaled_exactly():
     cameras = replace(camera([0.0] * 5), photos=None)
     boxes = Undistortion.of(cameras, 0, (1600, 1200)).boxes(torch.tensor([[100.0, 50, 300, 200], [1700, 10, 1800, 20]]))
-    assert boxes[0].tolist() == [10, 5, 30, 20] and boxes[1, 2] <= boxes[1, 0]  # the second is outside
+    assert boxes[0].tolist() == [10, 5, 30, 20] and boxes[1, 2] <= boxes[1, 0]  # the second box is outside
 
 
 def test_image_of_the_undistorted_view_is_not_warped():
@@ -165,7 +166,7 @@ def test_image_of_the_undistorted_view_is_not_warped():
 
 
 def test_cropped_photo_without_distortion():
-    # The view is the right half of the photo.
+    # the view is the right half of the photo
     K = intrinsics(100, 100, 100.0)
     whole = K.clone()
     whole[0, 2] += 100

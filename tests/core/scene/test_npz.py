@@ -1,4 +1,4 @@
-"""Arrays of NPZ files, and damaged archives, each of which ends in one clear error."""
+"""Arrays of NPZ files, and damaged archives, each of which causes one clear error."""
 
 import io
 import struct
@@ -37,7 +37,7 @@ def archive(content, name="a.npy", kind=zipfile.ZIP_STORED):
 
 
 def replaced(data, offset, new, signatures=((b"PK\x03\x04", 0), (b"PK\x01\x02", 2))):
-    """An archive with a field of its entry changed, in the entry and in the directory, where it is 2 bytes later."""
+    """An archive with a changed field of its entry, also changed in the directory, where its offset is 2 larger."""
     for signature, later in signatures:
         at = data.index(signature) + offset + later
         data = data[:at] + new + data[at + len(new) :]

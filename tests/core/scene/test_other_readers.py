@@ -28,7 +28,7 @@ def test_splat_transform_reads_our_files(tmp_path, degree):
     assert np.allclose(np.abs((quats * g.quats.numpy()).sum(1)), np.linalg.norm(quats, axis=1), rtol=1e-5)
     rest = [n for n in table.dtype.names if n.startswith("f_rest")]
     assert len(rest) == 3 * ((degree + 1) ** 2 - 1)
-    if rest:  # the file's order: all coefficients of red, then green, then blue
+    if rest:  # the file has all coefficients of red, then of green, then of blue
         ours = g.sh[:, 1:].permute(0, 2, 1).reshape(len(g), -1).numpy()
         assert np.allclose(np.stack([table[f"f_rest_{i}"] for i in range(len(rest))], 1), ours, atol=1e-6)
 

@@ -1,4 +1,4 @@
-"""The prompts in a traj.h5 are checked, so that all who read them may rely on their fields."""
+"""The prompts in a traj.h5 are checked when read, so that all code can rely on their fields."""
 
 import math
 import re
@@ -34,7 +34,7 @@ def test_others_are_refused(row, message):
         read_prompts([row], [2])
 
 
-LIMITS = [  # a row, the field of its value, the least and the greatest value
+LIMITS = [  # a row, the field of the value, and the minimum and maximum of the value
     (FORCE, "start", 0, 1e9), (FORCE, "object_id", 1, 65535), ({**CHANGE, "what": "friction"}, "value", 0, 100),
     (CHANGE, "value", -1e9, 1e9), ({"kind": "lift", "object_id": 2, "height": 0}, "height", -1e9, 1e9),
     (CHANGE, "start", 0, 1e9), ({"kind": "pin"}, "object_id", 1, 65535),

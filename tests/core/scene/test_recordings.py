@@ -1,4 +1,4 @@
-"""Folders of films, or of folders of frames, and their frames at limited size."""
+"""Folders of films or of folders of frames, whose frames are read at limited size."""
 
 from types import SimpleNamespace
 
@@ -93,14 +93,14 @@ def test_limited_images_are_means_of_areas():
 
 
 class Frame(SimpleNamespace):
-    """A frame of PyAV, 40 wide and 20 high."""
+    """Stub of a PyAV frame with 40 x 20 pixels."""
 
     width, height = 40, 20
 
     def reformat(self, width, height, format, interpolation):
         assert (format, interpolation) == ("rgb24", "AREA")
         pixels = np.zeros((height, width, 3), np.uint8)
-        pixels[0, -1] = 255  # upper right
+        pixels[0, -1] = 255  # the upper right pixel
         return SimpleNamespace(to_ndarray=lambda: pixels)
 
 

@@ -71,20 +71,20 @@ def test_damaged_lens_is_refused_in_one_line(tmp_path, two_balls):
 
 
 def test_stored_values_follow_the_standard_layout(tmp_path):
-    """Logits, logarithms and channel-major f_rest, read with plyfile alone."""
+    """Read with plyfile alone: logits, logarithms and f_rest in channel-major order."""
     g = random_gaussians(4, degree=1)
     write_scene(tmp_path / "s.ply", Scene(g))
     vertex = PlyData.read(str(tmp_path / "s.ply"))["vertex"]
     np.testing.assert_allclose(vertex["scale_1"], g.scales[:, 1].log(), rtol=1e-5)
     np.testing.assert_allclose(vertex["opacity"], g.opacities.logit(), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(vertex["rot_0"], g.quats[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(vertex["f_rest_3"], g.sh[:, 1, 1], rtol=1e-6)  # green, first of three
+    np.testing.assert_allclose(vertex["f_rest_3"], g.sh[:, 1, 1], rtol=1e-6)  # the first of three coefficients of green
     assert [p.name for p in vertex.properties][:6] == ["x", "y", "z", "nx", "ny", "nz"]
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_files_of_other_tools_are_read(tmp_path, order):
-    """No normals, an extra property, either byte order, quaternions of any length."""
+    """Files without normals, with an extra property, in either byte order, and with quaternions of any length."""
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
              "rot_0", "rot_1", "rot_2", "rot_3", "confidence"]  # fmt: skip
     row = np.zeros(2, [(name, f"{order}f4") for name in names])
@@ -115,7 +115,7 @@ def test_rows_that_are_not_finite_or_far_too_large_are_dropped_and_counted(tmp_p
 
 
 def test_packed_values_are_fractions_between_the_bounds_of_their_chunk(tmp_path):
-    """Gaussian 0 has the lowest values and 300, in the second chunk, the highest; w, then z, is the omitted one."""
+    """Gaussian 0 has the lowest values, 300 (in the second chunk) the highest; their omitted components are w and z."""
     n, ends = 301, ((-1.0, 3.0), (-5.0, 7.0))
     chunk = np.zeros(2, [(f"{end}_{part}{axis}", "<f4") for part in ("", "scale_") for end in ("min", "max")
                          for axis in "xyz"])  # fmt: skip
@@ -125,11 +125,11 @@ def test_packed_values_are_fractions_between_the_bounds_of_their_chunk(tmp_path)
             chunk[f"min_scale_{axis}"][i], chunk[f"max_scale_{axis}"][i] = low - 9, high - 9
     names = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
     vertex = np.zeros(n, [(name, "<u4") for name in names])
-    vertex["packed_rotation"] = 511 << 20 | 511 << 10 | 511  # w, as nearly as 10 bits allow
+    vertex["packed_rotation"] = 511 << 20 | 511 << 10 | 511  # w is 1, as nearly as 10 bits allow
     vertex["packed_rotation"][300] = 3 << 30 | 511 << 20 | 511 << 10 | 511
     vertex["packed_position"][300], vertex["packed_scale"][300], vertex["packed_color"][300] = [2**32 - 1] * 3
     vertex["packed_position"][1] = 1024 << 21 | 512 << 11 | 256
-    vertex["packed_rotation"][2] = 2 << 30 | 700 << 20 | 300 << 10 | 600  # w x z, of which y is the rest
+    vertex["packed_rotation"][2] = 2 << 30 | 700 << 20 | 300 << 10 | 600  # w, x and z are given, and y is computed
     PlyData([PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]).write(tmp_path / "p.ply")
     g = read_scene(tmp_path / "p.ply").gaussians
     torch.testing.assert_close(g.means[[0, 300]], torch.tensor([[-1.0] * 3, [7.0] * 3]))
@@ -143,7 +143,7 @@ def test_packed_values_are_fractions_between_the_bounds_of_their_chunk(tmp_path)
 
 
 def test_packed_colours_between_bounds_and_harmonics_in_bytes(tmp_path):
-    """Colours 0.2 + 0.6 f between the chunk's bounds; coefficients from -4 in steps of 8 / 256."""
+    """Colours are 0.2 + 0.6 f, between the chunk's bounds; coefficients start at -4 with steps of 8 / 256."""
     bounds = [(f"{end}_{part}{axis}", "<f4") for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
     chunk = np.zeros(1, bounds + [(f"{end}_{c}", "<f4") for end in ("min", "max") for c in "rgb"])
     for c in "rgb":
@@ -158,7 +158,7 @@ def test_packed_colours_between_bounds_and_harmonics_in_bytes(tmp_path):
     g = read_scene(tmp_path / "p.ply").gaussians
     torch.testing.assert_close(g.sh[0, 0] * 0.28209479177387814 + 0.5, torch.tensor([0.2, 0.32, 0.8]))
     torch.testing.assert_close(g.opacities, torch.tensor([0.4]))
-    coefficients = (28 * torch.arange(9) / 256 - 0.5) * 8  # the three of red, of green, of blue
+    coefficients = (28 * torch.arange(9) / 256 - 0.5) * 8  # three each of red, green and blue
     torch.testing.assert_close(g.sh[0, 1:], coefficients.reshape(3, 3).T)
 
 
@@ -196,7 +196,7 @@ def test_what_a_scene_has_once_is_in_one_comment(tmp_path, two_balls, key):
 
 
 def test_only_provenance_may_have_values_that_are_not_finite(tmp_path, two_balls):
-    """The options of a run may be infinite; a camera or an object may not."""
+    """Options of a run can be infinite, values of a camera or an object cannot."""
     write_scene(tmp_path / "s.ply", replace(two_balls, provenance={"options": {"limit": math.inf}}))
     assert read_scene(tmp_path / "s.ply").provenance == {"options": {"limit": math.inf}}
     data = (tmp_path / "s.ply").read_bytes()
@@ -211,7 +211,8 @@ def test_files_without_gaussians_or_of_another_degree_or_version_are_refused(tmp
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
              *(f"rot_{i}" for i in range(4))]  # fmt: skip
     for count, more, element, message in (
-        (0, [], "vertex", "holds no Gaussians"), (2, [], "vertex", "holds no Gaussians"),  # of quaternions of length 0
+        # the second file has quaternions of length 0
+        (0, [], "vertex", "holds no Gaussians"), (2, [], "vertex", "holds no Gaussians"),
         (2, [], "points", "has no element called vertex"),
         (2, [f"f_rest_{i}" for i in range(8)], "vertex", "8 f_rest properties; SH of degree 1, 2 or 3"),
     ):  # fmt: skip

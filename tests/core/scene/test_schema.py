@@ -1,4 +1,4 @@
-"""Checks of single values: what is accepted, up to which bound, and that the error names what is wrong."""
+"""Checks of single values: accepted values, limits, and errors that name the wrong value."""
 
 import math
 from contextlib import nullcontext
@@ -30,7 +30,7 @@ from stages.core.scene.schema import (
 )
 from stages.core.scene.sequence import MAX_FRAMES, FilmedSequence, read_sequence_json
 
-VALUES = [  # check, value, result; None: refused
+VALUES = [  # check, value, and its result, or None if the value is refused
     (number, 3, 3.0), (number, -LARGEST, -LARGEST), (number, LARGEST, LARGEST), (number, 1.01 * LARGEST, None),
     (number, np.float32(0.5), 0.5), (number, np.int64(7), 7.0), (number, True, None), (number, "3", None),
     (number, math.nan, None), (number, None, None), (number, -1.01 * LARGEST, None),
@@ -97,7 +97,7 @@ def test_json_files_are_bounded_files(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="not a file"):
         read_json(tmp_path)
     monkeypatch.setattr(schema, "MAX_JSON_BYTES", 11)
-    assert read_json(tmp_path / "a.json")  # of 11 bytes
+    assert read_json(tmp_path / "a.json")  # the file has 11 bytes
     monkeypatch.setattr(schema, "MAX_JSON_BYTES", 10)
     with pytest.raises(ValueError, match="at most 0 are read"):
         read_json(tmp_path / "a.json")
@@ -147,10 +147,10 @@ HEADER = ["ply", "format binary_little_endian 1.0", "element vertex 10", "proper
 
 @pytest.mark.parametrize(("size", "right"), [(130, True), (129, True), (128, False)])
 def test_counts_of_a_ply_fit_into_its_bytes(size, right):
-    """10 rows of 4 + 1 + 8 bytes; one byte less is what a last line without its end has."""
+    """10 rows of 4 + 1 + 8 bytes; one byte less is allowed, because the last line may lack its end."""
     with nullcontext() if right else pytest.raises(ValueError, match="declares 130 bytes or more; it has 128"):
         check_ply_counts(HEADER, size)
-    text = ["ply", "format ascii 1.0", *HEADER[2:]]  # at least a digit and a space for each
+    text = ["ply", "format ascii 1.0", *HEADER[2:]]  # at least a digit and a space for each value
     check_ply_counts(text, 60)
     with pytest.raises(ValueError, match="declares 60 bytes"):
         check_ply_counts(text, 58)

@@ -101,7 +101,7 @@ STORED = {"prompts": [], "provenance": {}, "field": start_of(UNITS), "confidence
 
 @pytest.mark.parametrize("what", STORED)
 def test_a_disk_that_is_full_ends_the_run_at_the_next_write(tmp_path, two_balls, what):
-    """HDF5 itself would not tell."""
+    """HDF5 itself would not report the error."""
     with (
         pytest.raises(InputError, match="t.h5: cannot be written .No space left on device."),
         TrajectoryWriter(tmp_path / "t.h5", two_balls, *parts(two_balls)) as writer,
@@ -125,7 +125,7 @@ def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
 
 
 def test_frames_in_the_buffer_are_in_the_file_when_it_is_read(tmp_path, two_balls):
-    """While it is written, after `store_prompts`; and after a restart only the new frames."""
+    """They are in the file during writing, after `store_prompts`; after a restart it has only the new frames."""
     info, keypoints, binding = parts(two_balls)
     with TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer:
         for t in range(BUFFERED + 3):
@@ -187,14 +187,14 @@ def test_frame_rate_for_other_readers_is_the_inverse_of_the_time_step(tmp_path, 
 
 @pytest.fixture(scope="module")
 def intact(tmp_path_factory):
-    """The bytes of a trajectory."""
+    """The bytes of a valid trajectory."""
     path = tmp_path_factory.mktemp("intact") / "t.h5"
     write(path, two_balls_scene())
     return path.read_bytes()
 
 
 def change(path, intact: bytes, name: str, value) -> None:
-    """Write a trajectory with another attribute, or another dataset where the name has a slash; None deletes it."""
+    """Write a trajectory with a changed attribute, or dataset if the name has a slash; None deletes it."""
     path.write_bytes(intact)
     with h5py.File(path, "a") as file:
         where = file if "/" in name else file.attrs
@@ -205,7 +205,7 @@ def change(path, intact: bytes, name: str, value) -> None:
 
 
 def test_attributes_are_read_as_other_languages_write_them(tmp_path, intact):
-    """Texts of fixed length, as C and MATLAB write them, and arrays of one number."""
+    """Texts have a fixed length, as written by C and MATLAB, and numbers may be arrays with one element."""
     path = tmp_path / "t.h5"
     path.write_bytes(intact)
     expected = read_trajectory(path)
@@ -253,7 +253,7 @@ def test_values_that_a_trajectory_cannot_have(tmp_path, intact, name, value, mes
     ("cameras/sizes", 1, 65536, 1),
 ])  # fmt: skip
 def test_values_up_to_the_limits_of_a_dataset_are_read(tmp_path, intact, name, low, high, step):
-    """Those of the file format; what other checks say of a value within them does not matter here."""
+    """Limits of the file format; errors of other checks for values within them are ignored here."""
     path = tmp_path / "t.h5"
     path.write_bytes(intact)
     with h5py.File(path, "a") as file:
@@ -280,7 +280,7 @@ def test_filters_that_are_not_read_are_named(tmp_path, intact):
         del file[name]
         filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         filters.set_chunk(values.shape)
-        filters.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # Blosc
+        filters.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # filter number of Blosc
         data = h5py.h5d.create(file.id, name, h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple(values.shape), filters)
         data.write_direct_chunk((0, 0, 0), values.tobytes())
     with pytest.raises(InputError, match="t.h5.*keypoints/positions is stored with filter 32001 of HDF5.*gzip"):
@@ -317,11 +317,11 @@ def test_times_between_frames_are_a_microsecond_to_hours(tmp_path, intact, dt, r
 
 @pytest.mark.parametrize("name", ["gaussians", "frames", "frames/means", "cameras", "forces", "objects/confidence"])
 def test_links_are_not_followed(tmp_path, intact, name):
-    """Not even to see whether something optional is there: HDF5 would wait for a pipe."""
+    """Optional parts are not even looked up through links, because HDF5 would wait for a pipe."""
     path, dataset = tmp_path / "t.h5", {"cameras": "cameras/viewmats", "forces": "forces/json"}.get(name)
     path.write_bytes(intact)
     with h5py.File(tmp_path / "other.h5", "w"):
-        pass  # has nothing of it, so that a reader who follows the link takes it for absent
+        pass  # it is empty, so that a reader that follows the link would consider the part absent
     with h5py.File(path, "a") as file:
         if name in file:
             del file[name]

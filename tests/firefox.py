@@ -1,4 +1,4 @@
-"""Firefox on a virtual display, drawn by software and driven by WebDriver BiDi, which it speaks without a driver."""
+"""Firefox on a virtual display with software rendering, controlled directly by WebDriver BiDi."""
 
 import itertools
 import json
@@ -21,7 +21,7 @@ PREFERENCES = {
 
 
 class FirefoxPage:
-    """One page; `evaluate` is that of playwright's pages, and `errors` are the messages of errors so far."""
+    """One page with the same `evaluate` as playwright's pages; `errors` are the error messages so far."""
 
     def __init__(self, socket, address: str):
         self._socket, self._number, self.errors = socket, itertools.count(1), []
@@ -32,7 +32,7 @@ class FirefoxPage:
         self._call("browsingContext.navigate", context=self._context, url=address, wait="complete")
 
     def evaluate(self, script: str, argument: object = None) -> object:
-        """The value of an expression, or of a function called with `argument`, once it is settled."""
+        """The awaited value of an expression, or of a function called with `argument`."""
         function = script if "=>" in script else f"() => ({script})"
         found = self._call(
             "script.callFunction",
@@ -44,7 +44,7 @@ class FirefoxPage:
         return json.loads(found["result"].get("value", "null"))
 
     def wait_for_timeout(self, milliseconds: float) -> None:
-        """Let the page go on."""
+        """Wait while the page continues."""
         self.evaluate("ms => new Promise(resolve => setTimeout(resolve, ms))", milliseconds)
 
     def _call(self, method: str, **parameters: object) -> dict:
@@ -68,7 +68,7 @@ class FirefoxPage:
 
 @pytest.fixture
 def open_firefox(tmp_path):
-    """A function that opens a file in Firefox; the test fails on errors of the page and where it fetches anything."""
+    """Function that opens a file in Firefox; the test fails if the page has errors or fetches anything."""
     for program in ("firefox", "Xvfb"):
         if shutil.which(program) is None:
             pytest.skip(f"no {program} on this machine (apt-get install firefox-esr xvfb libgl1-mesa-dri)")
@@ -80,7 +80,7 @@ def open_firefox(tmp_path):
     (profile / "user.js").write_text("".join(lines))
 
     def start(words: list[str], pattern: str, **options: object) -> str:
-        """Start a program; what its output has in the place of the group in `pattern`."""
+        """Start a program and return the part of its output that matches the group in `pattern`."""
         processes.append(subprocess.Popen(words, stderr=subprocess.PIPE, text=True, **options))
         found = (re.search(pattern, line) for line in processes[-1].stderr)
         return next(match[1] for match in found if match)

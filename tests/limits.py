@@ -1,4 +1,4 @@
-"""Limits: of the sizes of files, as on a full disk, and of the values of options."""
+"""Limits in tests: of the sizes of files, which simulates a full disk, and of the values of options."""
 
 import resource
 import sys
@@ -12,9 +12,9 @@ from stages.core.errors import InputError
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """No file may exceed `size` bytes, which a program notices like a full disk.
+    """Limit the size of every file to `size` bytes, which a program notices like a full disk.
 
-    No bytecode is written meanwhile: Python before 3.12.8 would keep what fits of it, which can never be imported.
+    Bytecode is not written meanwhile, because Python before 3.12.8 would keep a truncated file that cannot be imported.
     """
     (soft, hard), wrote = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
@@ -27,7 +27,7 @@ def file_size_limit(size: int) -> Iterator[None]:
 
 
 def check_limits(options: type, name: str, accepted: Iterable, refused: Iterable) -> None:
-    """An option takes the values `accepted`, and its name is in the errors of those `refused`."""
+    """Check that an option has the values `accepted`, and that errors for values `refused` begin with its name."""
     for value in accepted:
         assert getattr(options(**{name: value}), name) == value
     for value in refused:

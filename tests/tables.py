@@ -1,4 +1,4 @@
-"""Tables of Gaussians with known edges, above the ground, and cameras that look at them."""
+"""Tables of Gaussians with known edges above the ground, and cameras that see them."""
 
 import torch
 
@@ -8,11 +8,11 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 
 GROUND = -0.5
-LOW, HIGH = (-0.35, -0.25), (0.35, 0.25)  # corners of the usual table
+LOW, HIGH = (-0.35, -0.25), (0.35, 0.25)  # corners of the default table [m]
 
 
 def level(height: float, low: tuple[float, float], high: tuple[float, float], spacing: float, grey: float) -> Gaussians:
-    """Flat Gaussians on a rectangle."""
+    """Flat Gaussians in a horizontal rectangle."""
     xy = torch.cartesian_prod(*(torch.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)))
     n = len(xy)
     return Gaussians(
@@ -23,7 +23,7 @@ def level(height: float, low: tuple[float, float], high: tuple[float, float], sp
 
 
 def around(count: int = 8, side: int = 120) -> Cameras:
-    """Cameras all around, 1.3 from the middle of the table, which see past all of its edges."""
+    """Cameras on a circle, at a distance of 1.3 from the middle of the table, which see beyond all its edges."""
     viewmats = orbit(count, torch.zeros(3), 1.3, 40.0)
     K = intrinsics(side, side, float(side))
     names = tuple(f"{i:02d}.jpg" for i in range(count))
@@ -31,7 +31,7 @@ def around(count: int = 8, side: int = 120) -> Cameras:
 
 
 def table_scene(objects: Gaussians | None = None, low=LOW, high=HIGH, ground: float | None = GROUND) -> Scene:
-    """As photos give it: a table at height 0 over a larger ground."""
+    """A scene as reconstructed from photos: a table at height 0 above a larger ground."""
     parts = [level(0.0, low, high, 0.0125, 0.3)]
     parts += [] if ground is None else [level(ground, (-2, -2), (2, 2), 0.08, -0.3)]
     parts += [] if objects is None else [objects]

@@ -1,4 +1,4 @@
-"""Trajectories of the two balls with motion in closed form."""
+"""Trajectories of the two balls with analytic motion."""
 
 from dataclasses import replace
 
@@ -10,14 +10,14 @@ from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWr
 
 
 def rotation(angle: float) -> torch.Tensor:
-    """Rotation by an angle [rad] about an axis that is no coordinate axis."""
+    """Rotation by an angle [rad] about a fixed oblique axis."""
     axis = torch.tensor([1.0, 2, 2]) / 3
     half = torch.tensor(angle / 2)
     return matrix(torch.cat([half.cos()[None], half.sin() * axis]))
 
 
 def moved(points, object_id, t: int, spin: float = 0.15, speed: float = 0.03):
-    """Both objects rotate about their centres and drift along y, the second twice as fast, and fall."""
+    """Positions of points of two objects that rotate about their centres, fall and drift along y (the second more)."""
     out = points.clone()
     for id, centre in ((1, torch.tensor([-0.3, 0.0, 0.15])), (2, torch.tensor([0.3, 0.0, 0.40]))):
         mine = object_id == id
@@ -49,7 +49,7 @@ def renamed(scene, names):
 
 
 def transformed_scene(scene, similarity):
-    """The scene after a similarity transform."""
+    """The scene after a similarity transform of its Gaussians and cameras."""
     g = scene.gaussians
     g = replace(g, means=similarity(g.means), scales=g.scales * similarity.scale)
     return replace(scene, gaussians=g, cameras=scene.cameras.transformed(similarity))

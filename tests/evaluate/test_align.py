@@ -1,4 +1,4 @@
-"""Reference frames of two files: shared cameras, matched objects, and the similarity between them."""
+"""Reference frames of two files: common cameras, matched objects, and the similarity between them."""
 
 import math
 from contextlib import nullcontext
@@ -20,7 +20,7 @@ SHIFT = torch.tensor([0.0, 1.0, 0.0])
 
 
 def objects_at(objects, places, file="mine.h5") -> ReferenceFrame:
-    """Objects of two points each, half a unit from their centre."""
+    """Objects with two points each, at 0.5 from their centre."""
     half = torch.tensor([[0.5, 0, 0], [-0.5, 0, 0]])
     points = {o.id: torch.tensor(place) + half for o, place in zip(objects, places, strict=True)}
     return ReferenceFrame(file, None, tuple(objects), points)
@@ -32,7 +32,7 @@ def cameras_of(cameras, file="mine.h5", **more) -> ReferenceFrame:
 
 @pytest.mark.parametrize(("shift", "same"), [(0.0, True), (0.19, True), (0.21, False)])
 def test_shared_cameras_a_tenth_of_their_radius_apart_are_in_another_frame(shift, same):
-    """The radius of the ring is 2 cos 25 degrees; the distance is that of the cameras, whatever the objects say."""
+    """The cameras' radius is 2 cos 25 degrees; only the distance of the cameras counts, not that of the objects."""
     true = ring()
     moved = true.transformed(Similarity(1.0, torch.eye(3), shift * math.cos(math.radians(25)) * SHIFT))
     far = objects_at([BALL], [(99.0, 0, 0)])
@@ -48,7 +48,7 @@ def test_shared_cameras_a_tenth_of_their_radius_apart_are_in_another_frame(shift
 def test_cameras_of_other_names_are_not_shared():
     frame = ReferenceFrame("a", ring(count=3), (), {})
     other = replace(frame, cameras=replace(frame.cameras, names=("x.png", "y.png", "z.png")))
-    check_same_reference_frame(frame, other, [])  # nothing to tell them apart by
+    check_same_reference_frame(frame, other, [])  # nothing can distinguish the frames
     with pytest.raises(InputError, match="fewer than two camera names and fewer than two object names in common"):
         find_alignment(frame, other)
 
@@ -72,7 +72,7 @@ def test_one_shared_camera_does_not_locate_a_frame():
     truth = replace(objects_at([BALL, DUCK], [(4.0, 0, 0), (0.0, 0, 0)], "true.h5"), cameras=true)
     found, how = find_alignment(mine, truth)
     assert how == "aligned by the centres of ball, duck, keeping the vertical" and found.scale == pytest.approx(2)
-    check_same_reference_frame(cameras_of(alone), cameras_of(true), [])  # nothing is known of the frames
+    check_same_reference_frame(cameras_of(alone), cameras_of(true), [])  # the frames are unknown
     with pytest.raises(InputError, match="mine.h5 and true.h5 have fewer than two camera names and fewer than two obj"):
         find_alignment(cameras_of(alone), cameras_of(true, "true.h5"))
     one = objects_at([BALL], places[:1])
@@ -81,7 +81,7 @@ def test_one_shared_camera_does_not_locate_a_frame():
 
 
 def test_upright_alignment_is_the_least_squares_one():
-    """No turn about the vertical, scale or shift near the one found is nearer, for centres that do not correspond."""
+    """The centres do not correspond exactly; near rotations about the vertical, scales and shifts are worse."""
     rng = torch.Generator().manual_seed(0)
     source, target = torch.randn(2, 3, 3, generator=rng)
     target = 2 * source @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + 0.3 * target + 5
@@ -104,7 +104,7 @@ def test_centres_that_do_not_correspond_are_refused():
         objects_at([BALL, DUCK], [(0.0, 0, 1), (0.0, 0, 0)]),
     )
     with pytest.raises(InputError, match="the centres of the objects in the two files do not correspond"):
-        find_alignment(mine, truth)  # one stands on its head
+        find_alignment(mine, truth)  # one of them is upside down
 
 
 def test_cameras_at_one_position_have_no_scale():
@@ -130,7 +130,7 @@ def test_objects_are_matched_by_name_in_the_order_of_the_truth():
 
 
 def test_other_names_are_matched_by_the_smallest_sum_of_distances():
-    """The nearest of the first would leave the second with one far away."""
+    """The nearest match of the first object would leave a distant one for the second."""
     truth = objects_at([BALL, DUCK], [(0.0, 0, 0), (2.0, 0, 0)])
     a, b = SceneObject(1, "a"), SceneObject(2, "b")
     mine = objects_at([a, b], [(-9.0, 0, 0), (0.5, 0, 0)])

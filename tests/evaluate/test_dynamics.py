@@ -17,13 +17,13 @@ from stages.evaluate.dynamics import (
 
 
 def motion(t=20, o=2, p=5, seed=0):
-    """Random walks, so that every coordinate moves."""
+    """Random walks, so that every coordinate changes."""
     rng = torch.Generator().manual_seed(seed)
     return torch.randn(t, o, p, 3, generator=rng, dtype=torch.float64).cumsum(0)
 
 
 def test_constant_offset():
-    # Positions are wrong by d, displacements are right, and the correlation over time is invariant to an offset.
+    # positions have an offset d, displacements are correct, and the correlation over time is invariant to an offset
     truth, d = motion(), 0.25
     metrics = {k: float(v) for k, v in all_metrics(truth + d, truth).items()}
     expected = {"MSE": d * d, "RMSE": d, "PCE": 0.0, "FPE": d * 3**0.5, "R": 1.0, "R_pooled": 1.0}
@@ -37,21 +37,21 @@ def test_reversed_motion_has_correlation_minus_one():
 
 
 def test_two_frames_by_hand():
-    # One point whose truth moves by 3 along x and 4 along y, predicted at rest.
+    # one point that moves by 3 along x and 4 along y, and is predicted to be at rest
     truth = torch.zeros(2, 1, 1, 3)
     truth[1, 0, 0] = torch.tensor([3.0, 4.0, 0.0])
     still = torch.zeros_like(truth)
-    assert float(mse(still, truth)) == pytest.approx(25 / 6)  # 6 coordinates: 2 frames of 3
+    assert float(mse(still, truth)) == pytest.approx(25 / 6)  # 6 coordinates: 2 frames with 3 each
     assert float(rmse(still, truth)) == pytest.approx((25 / 6) ** 0.5)
     assert float(pce(still, truth)) == pytest.approx(5)
     assert float(fpe(still, truth)) == pytest.approx(5)
-    assert float(correlation(still, truth)) == 0  # a moving coordinate predicted at rest
+    assert float(correlation(still, truth)) == 0  # it is zero for a moving coordinate predicted to be at rest
     assert error_over_time(still, truth).squeeze().tolist() == [0, 5]
 
 
 def test_correlation_is_the_mean_of_numpy_corrcoef_over_moving_coordinates():
     truth, predicted = motion(), motion(seed=1)
-    truth[:, 1, :, 2] = 1e-5 * truth[:, 1, :, 2]  # at rest: excluded
+    truth[:, 1, :, 2] = 1e-5 * truth[:, 1, :, 2]  # at rest and therefore excluded
     series = [
         (predicted[:, o, p, i], truth[:, o, p, i]) for o in range(2) for p in range(5) for i in range(3)
         if not (o == 1 and i == 2)

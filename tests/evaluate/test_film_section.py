@@ -1,4 +1,4 @@
-"""What the report says of a simulated motion: its objects, where they are from, and what to try next."""
+"""The report's section on a simulated motion: its objects, the sources of their properties, and suggestions."""
 
 import html
 import math
@@ -27,7 +27,7 @@ def trajectory(tmp_path_factory):
 
 @pytest.fixture
 def known_volumes(monkeypatch):
-    """Without sampling the objects."""
+    """Replaces the volumes computed by sampling of the objects."""
     monkeypatch.setattr(film_section, "_volumes", lambda t: [0.5 * o.id for o in t.scene.objects])
 
 
@@ -41,7 +41,7 @@ def cells(table: str) -> list[list[str]]:
 
 def test_sizes_and_masses_are_in_metres_where_the_scale_is_known(trajectory):
     known = with_scene(trajectory, scale={"metres_per_unit": 2.0, "source": "given"})
-    shares = []  # of the volume of the ball
+    shares = []  # relative to the volume of the ball
     for t, unit, factor in ((trajectory, "units", 1), (known, "m", 2)):
         red, green = cells(film_section._objects(t))
         assert red[0] == "1 red ball" and green[0] == "2 green ball" and red[3] == "rubber"
@@ -85,12 +85,13 @@ def test_where_a_material_is_from(trajectory, known_volumes):
         ["wood", "given (--material)"], ["rubber", "stored in the scene"],
     ]  # fmt: skip
     other = with_scene(trajectory, objects=(SceneObject(1, "red ball", "cheese"), SceneObject(2, "x", "cheese")))
-    assert [row[3] for row in cells(film_section._objects(other))] == ["ball", "common"]  # of another tool
+    # materials stored by another tool
+    assert [row[3] for row in cells(film_section._objects(other))] == ["ball", "common"]
 
 
 @pytest.mark.parametrize("dense", [False, True])
 def test_the_film_is_of_keypoints(trajectory, known_volumes, monkeypatch, dense):
-    """A trajectory of another tool, with every Gaussian in every frame, is shown without it."""
+    """A dense trajectory of another tool, with every Gaussian in every frame, has no film."""
     monkeypatch.setattr(film_section, "read_trajectory", lambda path: replace(trajectory, dense=dense))
     monkeypatch.setattr(film_section, "_player", lambda trajectory, title: f"<iframe>{title}</iframe>")
     html = film_section.film_section(trajectory.path)
@@ -98,7 +99,7 @@ def test_the_film_is_of_keypoints(trajectory, known_volumes, monkeypatch, dense)
 
 
 def test_a_motion_of_the_learned_engine_can_be_played_on(trajectory, monkeypatch):
-    """By the field in the page; where that is of other weights, the film is shown alone."""
+    """The page contains the force field, unless its weights are different; then it contains only the film."""
     shown = []
     monkeypatch.setattr(film_section, "find_shadows", lambda scene, keypoints: None)
     monkeypatch.setattr(film_section, "pack_film", lambda scene, motion, settings, shadows: shown.append(motion.field))

@@ -28,7 +28,7 @@ def test_psnr_by_hand():
 
 
 def test_ssim_agrees_with_scipy():
-    # With scipy's Gaussian filter of radius 5, on windows inside the image.
+    # compared with scipy's Gaussian filter of radius 5, for windows inside the image
     a = random_image(0).double()
     b = (0.6 * a + 0.4 * random_image(1)).clamp(0, 1)
 

@@ -1,4 +1,4 @@
-"""Films judged by a model: a local server stands in for it and scores films by their brightness."""
+"""Films judged by a model, which a local server replaces that scores films by their brightness."""
 
 import base64
 import json
@@ -38,7 +38,7 @@ def films(tmp_path_factory):
 
 
 def by_brightness(body: dict) -> str:
-    """The reply of a judge to whom brighter is more realistic, and physics the opposite of looks."""
+    """Reply of a judge for whom bright films look realistic and have unrealistic physics."""
     scores, letter = {}, ""
     for part in body["messages"][0]["content"][1:]:
         if part["type"] == "text":
@@ -98,7 +98,8 @@ def test_mean_and_spread_over_the_repeats(chat_server, films, tmp_path):
     scores = (0.2, 0.5, 0.8)
     chat_server.script = [json.dumps({"A": {"physical_realism": s, "photo_realism": 1}}) for s in scores]
     row = judged([films / "ours/a.mp4"], tmp_path)["overall"]
-    assert row["PhotoR"] == 1 and row["PhysR"] == pytest.approx(0.5) and row["PhysR_sd"] is None  # of one film
+    # a single film has no standard deviation
+    assert row["PhotoR"] == 1 and row["PhysR"] == pytest.approx(0.5) and row["PhysR_sd"] is None
     facts = json.loads((tmp_path / "m.json").read_text())
     assert facts["objects"][f"{films / 'ours/a.mp4'}"]["PhysR_sd"] == pytest.approx(0.3)
 

@@ -1,4 +1,4 @@
-"""Objects of a scene against label images: known panoptic quality, what is not asked for, malformed input, report."""
+"""Comparison of a scene's objects with label images: panoptic quality, ignored objects, malformed input, report."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def overlap_of(truth: list, found: list, judged=None) -> LabelOverlap:
 
 
 def test_panoptic_quality_by_hand():
-    # object 1: 80 of 100 pixels found as 7, which has nothing else: IoU 0.8; object 2: missed; 9 covers only background
+    # IoU of object 1 is 0.8 (80 of 100 pixels are found as 7, which has no others); 2 is missed; 9 is only background
     truth = [1] * 100 + [2] * 100 + [0] * 300
     found = [7] * 80 + [0] * 20 + [0] * 100 + [9] * 60 + [0] * 240
     scores = overlap_of(truth, found).scores()
@@ -44,7 +44,7 @@ def test_panoptic_quality_by_hand():
 
 
 def test_half_an_object_is_a_match_without_being_a_hit():
-    # IoU 0.5 is not above 0.5: object 1 counts as missed and 4 as false
+    # the IoU of 0.5 is not above 0.5, so object 1 counts as missed and 4 as false
     scores = overlap_of([1] * 200 + [0] * 10, [4] * 100 + [0] * 110).scores()
     assert scores.iou == {1: 0.5} and scores.hits == {} and scores.false == [4]
     assert scores.summary()["PQ"] == 0 and scores.summary()["IoU"] == 0.5
@@ -67,16 +67,16 @@ def test_nothing_labelled_and_nothing_found():
 
 
 def billboards(pictures: list[np.ndarray], names: list[str], size: tuple[int, int]) -> Scene:
-    """A scene whose cameras, of this size, each look at a wall with a picture of object ids in opaque Gaussians.
+    """A scene whose cameras, of this size, each see a wall with a picture of object ids in opaque Gaussians.
 
-    Gaussians are blurred by half a pixel, and of equally distant ones the first covers the others: an object may lose
-    its last row and column.
+    Gaussians are blurred by half a pixel, and of equally distant ones the first is in front, so the last row and column
+    of an object may be missing.
     """
     (width, height), (h, w) = size, pictures[0].shape
     y, x = np.meshgrid((np.arange(h) + 0.5) / h - 0.5, (np.arange(w) + 0.5) / w - 0.5, indexing="ij")
     wall = np.stack([x, y * height / width, np.ones_like(x)], -1).reshape(-1, 3)
     viewmats = torch.eye(4).repeat(len(names), 1, 1)
-    viewmats[:, 0, 3] = -100.0 * torch.arange(len(names))  # beside each other, far apart
+    viewmats[:, 0, 3] = -100.0 * torch.arange(len(names))  # far apart from each other
     means = np.concatenate([wall + (100.0 * i, 0, 0) for i in range(len(names))])
     ids = torch.from_numpy(np.concatenate([p.ravel() for p in pictures]).astype(np.int64))
     n, K = len(means), intrinsics(width, height, float(width))
@@ -93,7 +93,7 @@ NAMES = {"1": {"name": "duck", "core": True}, "2": {"name": "mat", "core": False
 
 
 def picture(size: tuple[int, int] = SIZE, **boxes) -> np.ndarray:
-    """Labels of a view: a_5=(x0, y0, x1, y1) paints 5."""
+    """Labels of a view; for example, a_5=(x0, y0, x1, y1) fills a rectangle with 5."""
     out = np.zeros(size[::-1], np.int64)
     for name, (x0, y0, x1, y1) in boxes.items():
         out[y0:y1, x0:x1] = int(name.split("_")[1])
@@ -102,7 +102,7 @@ def picture(size: tuple[int, int] = SIZE, **boxes) -> np.ndarray:
 
 @pytest.fixture
 def labelled(tmp_path):
-    """A scene of one view and the labels of its photo: duck found whole, mat found, cup missed, something false."""
+    """A scene of one view and the labels of its photo: duck completely found, mat found, cup missed, a false object."""
     scene = billboards([picture(a_5=(4, 4, 24, 24), b_6=(30, 4, 50, 24), c_7=(4, 30, 24, 40))], ["a.b.jpg"], SIZE)
     write_scene(tmp_path / "labelled.ply", scene)
     truth = picture(a_1=(4, 4, 24, 24), b_2=(30, 4, 50, 24), c_3=(40, 30, 60, 40), d_255=(0, 44, 64, 48))
@@ -120,7 +120,7 @@ def test_objects_that_are_not_core_are_left_out(labelled, capsys):
     write_labels(labelled / "labels/c.png", torch.ones(5, 5, dtype=torch.int64))
     facts = evaluate(labelled)
     assert "label images of photos that the scene has no camera for: c.png" in facts["notes"]
-    # judged pixels: all but the mat's 400 and the 4 rows of 255
+    # all pixels are judged except the mat's 400 and the 4 rows of 255
     assert facts["kind"] == "labels" and facts["overall"]["pixels"] == 64 * 48 - 400 - 4 * 64
     assert facts["objects"]["duck"]["IoU"] > 0.94 and facts["objects"]["cup"] == {"IoU": 0.0, "pixels": 200}
     assert "mat" not in facts["objects"] and "neither asked for nor held against the result: mat" in facts["notes"]
@@ -136,9 +136,10 @@ def test_objects_that_are_not_core_are_left_out(labelled, capsys):
 def test_objects_are_painted_over_the_photo_in_grey_with_white_borders():
     ids = torch.tensor([0] * 3 + [1] * 3 + [2] * 3 + [1] * 3).repeat(2, 1)
     judged = torch.ones(2, 12, dtype=torch.bool)
-    judged[:, 9:] = False  # what is labelled 1 there does not count
+    judged[:, 9:] = False  # labels of 1 in this area must not count
     out = paint(torch.full((2, 12, 3), 0.5), ids, {1: (0.0, 1.0, 0.0)}, judged)
-    expected = torch.tensor([[0.3] * 3, [0.12, 0.72, 0.12], [0.66, 0.18, 0.18], [0.48] * 3])  # 2 has no colour: red
+    # object 2 has no colour and is therefore red
+    expected = torch.tensor([[0.3] * 3, [0.12, 0.72, 0.12], [0.66, 0.18, 0.18], [0.48] * 3])
     torch.testing.assert_close(out[0, [1, 5, 8, 10]], expected)
     assert (out[:, [3, 6, 9]] == 1).all() and (out == 1).all(-1).sum() == 6
 
@@ -155,7 +156,7 @@ def test_report_shows_photo_truth_and_found(labelled):
 
 
 def test_label_image_through_a_lens(labelled):
-    # k1 = -0.25: a label image of the photo fits only after undistortion
+    # with k1 = -0.25, a label image of the photo matches only after undistortion
     size, photo_size, focal = (256, 192), (320, 240), 275.0
     boxes = (8, 8, 48, 56), (200, 120, 248, 184)
     scene = billboards([picture(size, a_5=boxes[0], b_6=boxes[1])], ["a.b.jpg"], size)
@@ -166,7 +167,7 @@ def test_label_image_through_a_lens(labelled):
     x = taken
     for _ in range(60):
         x = taken / (1 - 0.25 * (x**2).sum(-1, keepdims=True))
-    column, row = ((x * size[0] + np.array(size) / 2)[..., i] for i in (0, 1))  # in the view
+    column, row = ((x * size[0] + np.array(size) / 2)[..., i] for i in (0, 1))  # position in the view [px]
     truth = np.zeros(photo_size[::-1], np.int64)
     for number, (x0, y0, x1, y1) in zip((1, 3), boxes, strict=True):
         truth[(column >= x0) & (column < x1) & (row >= y0) & (row < y1)] = number
@@ -240,7 +241,7 @@ def test_other_wrong_inputs(labelled):
 
 
 def imperfect(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Object ids of a scene that finds most of these labels: shifted, two merged, one split, one missed, one new."""
+    """Object ids of an imperfect scene for these labels: shifted, two merged, one split, one missed, one additional."""
     found = np.roll(np.where(labels == 255, 0, labels), rng.integers(-1, 2, 2), (0, 1)) + 20 * (labels > 0)
     present = [i for i in np.unique(found) if i]
     if len(present) > 3:
@@ -255,7 +256,7 @@ def imperfect(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("name", [pytest.param("tum_fr2_desk", marks=pytest.mark.slow), "kitchen", "kermit", "banana"])
 def test_figures_agree_with_an_independent_scorer(shared, tmp_path, name, capsys, monkeypatch):
-    """score.py beside the label images, on views of the size that `ngff reconstruct` gives them by default."""
+    """The scorer is score.py in the folder of the label images; views have the default size of `ngff reconstruct`."""
     folder, rng = shared / "labels" / name, np.random.default_rng(0)
     files = sorted(folder.glob("*.png"))
     labels = [read_labels(file).numpy() for file in files]
@@ -274,6 +275,6 @@ def test_figures_agree_with_an_independent_scorer(shared, tmp_path, name, capsys
     assert {k: ours[v] for k, v in columns.items()} == pytest.approx({k: theirs[k] for k in columns}, abs=0.01)
     assert theirs["found"] > 0 and 0.3 < theirs["mIoU"] < 0.95
     listed = {line[4:44].strip(): float(line.rpartition("IoU ")[2]) for line in lines}
-    # printed with two digits; where the view is smaller than the label image, score.py samples the corners of pixels
-    # and not their centres, which matters for a few objects of less than 1000 pixels
+    # Values are printed with two digits. If the view is smaller than the label image, score.py samples corners instead
+    # of centres of pixels, which is relevant for a few objects of less than 1000 pixels.
     assert {key[:40]: row["IoU"] for key, row in facts["objects"].items()} == pytest.approx(listed, abs=0.02)

@@ -1,4 +1,4 @@
-"""Options of `ngff evaluate`: the limits of their values."""
+"""Options of `ngff evaluate`: limits of their values."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The HTML report: axes, curves, pictures and table against values computed by hand."""
+"""The HTML report: axes, curves, images and table, compared with values computed by hand."""
 
 import base64
 import math
@@ -14,7 +14,7 @@ from stages.evaluate.label_pictures import RED, LabelColours
 from stages.evaluate.report import _round_up, write_report
 from stages.evaluate.result import Curve, Pictures, Result
 
-RIGHT, TOP, FLOOR, LEFT = 710, 16, 244, 60  # the frame of the plot [px]
+RIGHT, TOP, FLOOR, LEFT = 710, 16, 244, 60  # edges of the plot area [px]
 
 
 def page(folder: Path, curves: list[Curve] = (), **fields) -> str:
@@ -24,24 +24,24 @@ def page(folder: Path, curves: list[Curve] = (), **fields) -> str:
 
 
 def lines(html: str) -> list[list[tuple[float, float]]]:
-    """The corners of each curve."""
+    """The points of each curve."""
     return [[tuple(map(float, corner.split(","))) for corner in points.split()]
             for points in re.findall(r'<polyline points="([^"]*)"', html)]  # fmt: skip
 
 
 def labels(html: str, anchor: str) -> list[tuple[float, float, str]]:
-    """x, y and text of the labels of an axis."""
+    """Positions (x, y) and texts of the labels of an axis."""
     found = re.findall(rf'<text x="([\d.]+)" y="([\d.]+)" text-anchor="{anchor}">([^<]*)</text>', html)
     return [(float(x), float(y), text) for x, y, text in found]
 
 
 def test_curves_fill_the_frame_and_axes_have_round_ends(tmp_path):
     html = page(tmp_path, [Curve("a", [0.0, 1.0, 2.0, 3.0, 4.0]), Curve("SSIM", [9.0] * 5)], fps=2.0)
-    (corners,) = lines(html)  # SSIM has another unit
+    (corners,) = lines(html)  # SSIM has a different unit
     heights = [FLOOR - v / 5 * (FLOOR - TOP) for v in range(5)]  # the axis ends at the next 1, 2 or 5
     assert corners == [pytest.approx((LEFT + i * (RIGHT - LEFT) / 4, y), abs=0.05) for i, y in enumerate(heights)]
     across = labels(html, "middle")
-    assert [text for *_, text in across] == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s"]  # 5 frames, 2 a second
+    assert [text for *_, text in across] == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s"]  # 5 frames at 2 per second
     assert [x for x, *_ in across] == pytest.approx([LEFT + i * (RIGHT - LEFT) / 4 for i in range(5)], abs=0.05)
     up = labels(html, "end")
     assert [text for *_, text in up] == ["0", "2.5", "5"] and all(x < LEFT for x, *_ in up)
@@ -54,7 +54,7 @@ def test_frames_without_a_time_are_numbered_and_gaps_are_left_out(tmp_path):
     html = page(tmp_path, [Curve("a", [1.0, math.nan, 2.0, math.inf, 1.0])])
     assert [text for *_, text in labels(html, "middle")] == ["0", "1", "2", "3", "4"]
     assert lines(html) == [[(LEFT, pytest.approx((FLOOR + TOP) / 2)), ((LEFT + RIGHT) / 2, TOP), (RIGHT, 130.0)]]
-    assert not lines(page(tmp_path, [Curve("a", [1.0])])) and not lines(page(tmp_path))  # a point is no curve
+    assert not lines(page(tmp_path, [Curve("a", [1.0])])) and not lines(page(tmp_path))  # a point is not a curve
 
 
 @pytest.mark.parametrize(("highest", "end"), [(0.0, "1"), (0.3, "0.5"), (1.0, "1"), (1.1, "2"), (7.0, "10")])
@@ -99,9 +99,9 @@ def test_objects_have_colours_that_differ_and_are_not_that_of_false_ones():
     colours = torch.tensor(list(LabelColours.of(dict.fromkeys(range(12), 1.0), {}).truth.values()))
     assert colours.min() >= 0 and colours.max() == 1 and colours.unique(dim=0).shape == (12, 3)
     distance = torch.cdist(colours, colours) + 9 * torch.eye(12)
-    pale = colours.amin(1) > 0  # every other one: white is mixed in
+    pale = colours.amin(1) > 0  # every other colour is mixed with white
     assert pale.tolist() == 6 * [True, False]
-    assert distance.min() > 0.05 and distance.diagonal(1).min() > 0.5  # neighbours are far apart
+    assert distance.min() > 0.05 and distance.diagonal(1).min() > 0.5  # neighbours differ clearly
     assert (colours - torch.tensor(RED)).norm(dim=1).min() > 0.2
     of = LabelColours.of({5: 1.0, 7: 1.0}, {7: 3})
     assert of.found == {3: of.truth[7]} and of.truth[5] != of.truth[7]

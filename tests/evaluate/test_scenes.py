@@ -18,7 +18,7 @@ from tests.evaluate.motions import rotation, transformed_scene
 def test_chamfer_by_hand():
     mine = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     true = torch.tensor([[0.0, 0, 3]])
-    # distances are 3 and sqrt(10) to the truth, and 3 to the prediction
+    # distances are 3 and sqrt(10) from prediction to truth, and 3 from truth to prediction
     found = chamfer(nearest_neighbours(mine, true), nearest_neighbours(true, mine))
     there = (3 + 10**0.5) / 2
     assert found == pytest.approx({"chamfer": (there + 3) / 2, "to_truth": there, "to_prediction": 3})

@@ -43,7 +43,7 @@ def test_report_of_trajectories_has_a_curve_per_object(tmp_path, two_balls):
     assert html.count("<polyline") == 2 and "red ball" in html and "http" not in html.replace("http-equiv", "")
     ends = [float(points.split()[-1].split(",")[1]) for points in re.findall(r'points="([^"]*)"', html)]
     starts = [float(points.split()[0].split(",")[1]) for points in re.findall(r'points="([^"]*)"', html)]
-    assert starts[0] == starts[1] > ends[0] > ends[1]  # errors grow, those of the faster ball more (y points down)
+    assert starts[0] == starts[1] > ends[0] > ends[1]  # errors increase, for the faster ball more (y points down)
 
 
 def test_report_has_a_player_whose_time_is_that_of_the_curves(tmp_path, two_balls, open_page):
@@ -67,7 +67,7 @@ def test_report_shows_photos_objects_and_times(tmp_path, two_balls):
     true = write_motion(tmp_path / "true.h5", scene)
     (tmp_path / "photos").mkdir()
     for name in scene.cameras.names:
-        write_png(tmp_path / "photos" / name, torch.full((64, 90, 3), 0.5))  # the lens is not known
+        write_png(tmp_path / "photos" / name, torch.full((64, 90, 3), 0.5))  # the lens is unknown
     for photos, shown in ((tmp_path / "photos", ["photo", "drawing", "objects"]), (None, ["drawing", "objects"])):
         run(true, true, None, EvaluateOptions(report=tmp_path / "report.html", photos=photos))
         html = (tmp_path / "report.html").read_text()

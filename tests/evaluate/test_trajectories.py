@@ -44,7 +44,7 @@ def test_identical_trajectories(tmp_path, two_balls, capsys):
 def test_offset_of_one_object_affects_its_row_only(tmp_path, two_balls):
     write_motion(tmp_path / "true.h5", two_balls)
     shift = torch.zeros(200, 3)
-    shift[100:, 2] = 0.3  # green ball, up
+    shift[100:, 2] = 0.3  # shifts the green ball up
     write_motion(tmp_path / "mine.h5", two_balls, change=lambda positions: positions + shift)
     facts = evaluate(tmp_path)
     assert facts["objects"]["red ball"]["FPE"] == 0
@@ -69,7 +69,7 @@ def test_frames_that_the_truth_has_lost_do_not_count(tmp_path, two_balls):
 
 
 def test_different_keypoints_with_the_same_motion_agree(tmp_path, two_balls):
-    # Skinning reproduces rigid motion exactly, independent of the keypoints: only rounding errors remain.
+    # skinning reproduces rigid motion exactly for any keypoints, so only rounding errors remain
     write_motion(tmp_path / "true.h5", two_balls, seed=0, count=100)
     write_motion(tmp_path / "mine.h5", two_balls, seed=1, count=60)
     facts = evaluate(tmp_path)
@@ -100,7 +100,7 @@ def test_objects_are_matched_by_id_or_by_centre(tmp_path, two_balls):
 
 
 def test_objects_are_matched_by_their_centres_after_the_alignment(tmp_path, two_balls):
-    """The prediction is turned by half a turn and has other names and numbers."""
+    """The prediction is rotated by 180 degrees and has different names and numbers."""
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     g, still = two_balls.gaussians, {"frames": 2, "spin": 0.0, "speed": 0.0}
     other = renamed(replace(two_balls, gaussians=replace(g, object_id=torch.tensor([0, 2, 1])[g.object_id])), "ab")
@@ -113,14 +113,14 @@ def test_objects_are_matched_by_their_centres_after_the_alignment(tmp_path, two_
 
 @pytest.mark.parametrize("cameras", [True, False], ids=["cameras", "objects"])
 def test_align_inverts_a_similarity(tmp_path, two_balls, cameras):
-    # A rotation about the vertical: two objects determine no other; cameras would determine any.
+    # a rotation about the vertical, the only one that two objects determine; cameras would determine any
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     away = Similarity(2.5, quarter, torch.tensor([3.0, -1.0, 0.5]))
     scene = two_balls if cameras else replace(two_balls, cameras=None)
     write_motion(tmp_path / "true.h5", scene)
     far = transformed_scene(two_balls, away)
     far = far if cameras else replace(far, cameras=None)
-    mine = write_motion(tmp_path / "mine.h5", far)  # its motion is overwritten by that of the truth, transformed
+    mine = write_motion(tmp_path / "mine.h5", far)  # its motion is replaced by the transformed true motion
     with h5py.File(tmp_path / "true.h5") as true, h5py.File(mine, "a") as file:
         file["keypoints/positions"][...] = away(torch.from_numpy(true["keypoints/positions"][()])).numpy()
     with pytest.raises(InputError, match="--align"):
@@ -156,7 +156,7 @@ def test_different_lengths_and_rates_need_an_option(tmp_path, two_balls):
         evaluate(tmp_path)
     facts = evaluate(tmp_path, resample=True)
     assert facts["overall"]["frames"] == 12
-    assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # both fall by 0.01 per frame: 22 frames against 11
+    assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # both fall by 0.01 per frame, in 22 and 11 frames
 
 
 @pytest.mark.parametrize(("dt", "same"), [(0.0200019, True), (0.020003, False), (0.019997, False)])
@@ -171,7 +171,7 @@ def test_rates_that_differ_by_a_ten_thousandth_are_the_same(tmp_path, two_balls,
 
 
 def test_resampling_takes_the_nearest_frames_before_and_after(tmp_path, two_balls):
-    """Of a motion with acceleration, which other frames would not give: exact at its own frames, a mean in between."""
+    """For accelerated motion, the prediction is exact where its frames have the time, and else a mean of two frames."""
 
     def accelerated(dt: float, count: int):
         frames = iter(range(count))
@@ -181,7 +181,7 @@ def test_resampling_takes_the_nearest_frames_before_and_after(tmp_path, two_ball
     write_motion(tmp_path / "mine.h5", two_balls, frames=7, dt=0.02, change=accelerated(0.02, 7), **still)
     write_motion(tmp_path / "true.h5", two_balls, frames=5, dt=0.03, change=accelerated(0.03, 5), **still)
     facts = evaluate(tmp_path, resample=True)
-    # the fall of .01 per frame of `write_motion` differs as well: by half a frame in frame 1, and so on
+    # the fall of 0.01 per frame by `write_motion` differs too, by half a frame in frame 1 and so on
     expected = []
     for n in range(5):
         before, after = (n * 3 // 2) * 0.02, -(-n * 3 // 2) * 0.02
@@ -203,7 +203,7 @@ def test_missing_objects_are_named_in_the_error(tmp_path, two_balls):
 
 @pytest.mark.parametrize(("shift", "same"), [(0.0, True), (1.9, True), (2.1, False)])
 def test_objects_far_apart_are_in_another_frame_of_reference(shift, same):
-    """Without cameras: beyond two root mean square radii, here of points at distance 1 from their mean."""
+    """Without cameras, the limit is two root mean square radii; the points are at distance 1 from their mean."""
     points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]]) + torch.tensor([50.0, 0, 0])
     ball = SceneObject(1, "ball")
     truth = ReferenceFrame("true.h5", None, (ball,), {1: points})
@@ -240,7 +240,7 @@ def test_suffixes_may_be_in_capitals(tmp_path, two_balls):
 
 @pytest.mark.parametrize(("frames", "compared"), [(1, 1), (5, 3), (7, 5), (9, 5)])
 def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, frames, compared):
-    """Of 5 frames at 0, 0.03, ... s, those up to the last of the prediction at 0, 0.02, ... s."""
+    """The truth has 5 frames at 0, 0.03, ... s; those within the prediction's frames at 0, 0.02, ... s are compared."""
     two_balls = replace(two_balls, gaussians=two_balls.gaussians[::50], cameras=None)
     still = {"spin": 0.0, "speed": 0.0, "count": 4}
     write_motion(tmp_path / "true.h5", two_balls, frames=5, dt=0.03, **still)
@@ -249,7 +249,7 @@ def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, f
         with pytest.raises(InputError, match=f"{compared} frames, but .* has 5; give --frames {compared}"):
             evaluate(tmp_path, resample=True)
     facts = evaluate(tmp_path, resample=True, frames=compared)
-    # it falls by 0.01 per frame of its own, 0.015 per frame of the truth, which falls by 0.01
+    # the prediction falls by 0.01 per own frame, thus 0.015 per frame of the truth, which falls by 0.01
     assert facts["per_frame"]["red ball"] == pytest.approx([0.005 * t for t in range(compared)], abs=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""examples/force_prompts: both engines follow the prompted forces."""
+"""examples/force_prompts: both engines obey the force prompts."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Examples started without arguments print their usage, and with arguments run as programs."""
+"""Examples without arguments print their usage, and with arguments they run as programs."""
 
 import runpy
 from pathlib import Path
@@ -13,7 +13,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 @pytest.fixture
 def start(monkeypatch):
-    """Runs an example as `python SCRIPT ARGS` does."""
+    """Function that runs an example like `python SCRIPT ARGS`."""
 
     def run(script: Path, *args: object) -> None:
         monkeypatch.setattr("sys.argv", [str(script), *map(str, args)])

@@ -1,4 +1,4 @@
-"""Test objects for registration: an asymmetric object in four colours, random similarities."""
+"""Test objects for registration: an asymmetric object in four colours, and random similarities."""
 
 import torch
 
@@ -10,7 +10,7 @@ from tests.segment.tabletop import coloured_gaussians
 
 
 def asymmetric_object(spacing: float = 0.012) -> Gaussians:
-    """A red slab with a green tower at one corner, a blue egg at another, and a yellow bar across; side about 1."""
+    """A red slab with a green tower and a blue egg at two corners and a yellow bar across it; its size is about 1."""
     return concatenate([
         coloured_gaussians(box((0.9, 0.6, 0.2), spacing), (0.8, 0.1, 0.1), 1),
         coloured_gaussians(box((0.2, 0.2, 0.5), spacing).moved((0.3, 0.15, 0.35)), (0.1, 0.6, 0.2), 1),

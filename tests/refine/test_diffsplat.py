@@ -1,4 +1,4 @@
-"""The completer "diffsplat", with true output maps in place of the network, and with random weights."""
+"""The completer "diffsplat", with true output maps instead of the network, and with random weights."""
 
 import logging
 from dataclasses import replace
@@ -33,7 +33,8 @@ from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 SIDE = 128
 pytestmark = pytest.mark.usefixtures("device")
 PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.02, -0.03, 0.04]))
-OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.tensor([0.03, -0.02, 0.03]))  # 5 degrees
+# includes a rotation by 5 degrees
+OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.tensor([0.03, -0.02, 0.03]))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
-    """The part of the object on a table that three cameras on one side see."""
+    """The visible part of an object on a table for three cameras on one side."""
     scene = scene_of(table_gaussians(0.02), truth)
     scene = replace(scene, cameras=scene.cameras[:3], objects=(SceneObject(1, "toy_thing"),))
     g = scene.gaussians
@@ -53,7 +54,7 @@ def seen(truth) -> Scene:
 def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
     """The output maps of a perfect network: colour and depth rendered from DiffSplat's cameras."""
     viewmats = cameras(elevation)
-    # the centres of corner pixels are the corners of the image
+    # the pixel centres in the corners are the corners of the image
     K = intrinsics(SIDE, SIDE, FOCAL * (SIDE - 1)).expand(4, 3, 3)
     drawn = rasterise(g, viewmats, K, SIDE, SIDE)
     maps = torch.zeros(4, 12, SIDE, SIDE)
@@ -67,7 +68,7 @@ def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def perfect(seen, truth):
-    """In place of the network: the true object, slightly displaced from the pose of the crop's camera."""
+    """Replaces the network; returns the true object, slightly displaced from the pose of the crop's camera."""
     place = crop_object(seen, opaque_gaussians(seen, 1), SIDE).place
     R = place.rotation.mT
     back = Similarity(1 / place.scale, R, -(R @ place.translation) / place.scale)
@@ -111,7 +112,7 @@ def test_keep_raw_adds_the_uncompleted_object(seen, whole):
 
 
 def test_registration_of_a_featureless_object_with_a_hint():
-    """A plain cylinder's part has no features to match; near a hint it is found."""
+    """The part of a plain cylinder has no features to match; it is found close to a hint."""
     plain = coloured_gaussians(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
     there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
     part = transformed(plain, there)[plain.means[:, 0] > -0.05]
@@ -145,7 +146,7 @@ def test_upscaling_needs_the_generator():
 
 @pytest.mark.slow
 def test_output_of_random_weights_is_rejected(seen, tmp_path, caplog, monkeypatch):
-    """Random weights in the published layouts, through both loaders, OSEDiff, a sampler with fewer steps, and fits."""
+    """Random weights in the published layouts, with both loaders, OSEDiff, a sampler with fewer steps, and fits."""
     pytest.importorskip("diffusers")
     pytest.importorskip("transformers")
     from stages.core.models.diffsplat import network

@@ -1,4 +1,4 @@
-"""Inpainting: brightness gradients, texture, edges, and degenerate images."""
+"""Inpainting: brightness gradients, texture, edges and degenerate images."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def middle(size: int = 24) -> np.ndarray:
 
 
 def filled(rgb: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """What is inpainted when the hole holds a colour that must not come out."""
+    """The inpainted image; before, the hole has a colour that must not occur in the result."""
     return inpaint(np.where(hole[..., None], np.float32([1, 0, 1]), rgb).astype(np.float32), hole, ~hole, 0)
 
 
@@ -34,7 +34,7 @@ def test_brightness_gradient_continues_without_a_seam():
 
 
 def test_colours_are_interpolated_between_pure_pixels_where_too_few_are_known():
-    """Around the hole the table has colours of the object; only stripes of it are known, too narrow to copy from."""
+    """The table around the hole has colours of the object; known stripes of it are too narrow for copying."""
     hole, y = middle(40), np.mgrid[:SIDE, :SIDE][0]
     known = ~hole & (y % 6 < 2)
     beside = middle(52)
@@ -45,7 +45,7 @@ def test_colours_are_interpolated_between_pure_pixels_where_too_few_are_known():
 
 @pytest.mark.parametrize("shade", [0.0, 0.3], ids=["even", "lit from one side"])
 def test_checker_pattern_continues(shade):
-    """A period of 12 cells: what is copied must be in step with what is around, at both sides of the hole."""
+    """A pattern with a period of 12 cells, so copies must fit to both sides of the hole."""
     y, x = np.mgrid[:SIDE, :SIDE]
     value = 0.3 + 0.4 * ((x // 6 + y // 6) % 2) + shade * x / SIDE
     rgb = np.stack([value, 0.5 * value, 0.8 * value], -1).astype(np.float32)
@@ -54,7 +54,7 @@ def test_checker_pattern_continues(shade):
 
 @pytest.mark.parametrize("slope", [-0.6, pytest.param(0.3, marks=pytest.mark.slow)], ids=["falling", "rising"])
 def test_straight_edges_continue(slope):
-    """Across a wide round hole runs a strip of table between two woven mats: no mean of all three, and no bulge."""
+    """A strip of table between two woven mats crosses a wide round hole; it must be neither blurred nor widened."""
     side, colours = 120, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])
     y, x = np.mgrid[:side, :side] - side / 2
     away = (y - slope * x) / np.hypot(1, slope)
@@ -72,12 +72,12 @@ def test_straight_edges_continue(slope):
 def test_best_of_several_trials_is_used(monkeypatch):
     y, x = np.mgrid[:SIDE, :SIDE]
     rgb = np.repeat((0.3 + 0.4 * ((x // 6 + y // 6) % 2))[..., None], 3, 2).astype(np.float32)
-    hole = middle(6)  # filled without a coarser level
+    hole = middle(6)  # small enough to be filled without a coarser level
     monkeypatch.setattr("stages.refine.inpaint.TRIES", 1)
     alone, tries = filled(rgb, hole), []
 
     def spoiled(level, rng, *numbers):
-        """The first try as it is, black ones after it."""
+        """The first trial is correct; later ones are black."""
         tries.append(searched(level, rng, *numbers))
         if len(tries) > 1:
             level.image[level.hole] = 0.0
@@ -90,7 +90,7 @@ def test_best_of_several_trials_is_used(monkeypatch):
 
 
 def test_texture_contrast_is_kept():
-    """Noise cannot be reproduced, but its standard deviation can."""
+    """Noise cannot be reproduced exactly, but its standard deviation can."""
     rgb = 0.5 + 0.1 * np.random.default_rng(0).standard_normal((SIDE, SIDE, 3)).astype(np.float32)
     out = filled(rgb.clip(0, 1), middle())
     assert 0.06 < out[middle()].std() < 0.14

@@ -1,4 +1,4 @@
-"""The completer "library": a matching asset completes the object, others are rejected."""
+"""The completer "library": a matching asset completes an object, others are rejected."""
 
 import logging
 from dataclasses import replace
@@ -28,7 +28,7 @@ from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 SIZE, TURN = 0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4]))
 PLACE = Similarity(SIZE, TURN, torch.tensor([0.02, -0.03, 0.1 * SIZE]))
 pytestmark = pytest.mark.usefixtures("device")
-DARK = 0.85  # brightness of the object in the photos, relative to the library
+DARK = 0.85  # brightness of the object in the photos relative to that in the library
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
-    """The part of the object on a table that four cameras on one side see, darker than in the library."""
+    """The visible part of an object on a table for four cameras on one side, darker than in the library."""
     black = -0.5 / C0
     scene = scene_of(table_gaussians(0.02), replace(truth, sh=black + DARK * (truth.sh - black)))
     all_round = scene.cameras

@@ -1,4 +1,4 @@
-"""Object crops: the warped photo equals the view of a rotated camera, whose pose is that of the network."""
+"""Object crops: the warped photo equals the view of a rotated camera that has the pose of the network's camera."""
 
 import math
 from dataclasses import replace
@@ -28,7 +28,7 @@ PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """The object on a table, off-centre in all views, from 25 degrees elevation and once from 85."""
+    """An object on a table, off-centre in all views; one view has an elevation of 85 degrees, the others 25."""
     viewmats = orbit(6, torch.tensor([0.0, 0, 0.1]), 1.0, 25.0)
     steep = orbit(1, torch.tensor([0.0, 0, 0.1]), 0.8, 85.0)
     K = intrinsics(320, 240, 340.0)
@@ -66,7 +66,7 @@ def test_object_is_alone_centred_and_fills_the_crop(shown):
 
 
 def test_rotated_photo_equals_the_view_of_a_rotated_camera(scene, shown):
-    """Against the object rendered alone by the camera at the photo's position, rotated to place(0)."""
+    """It is compared with a rendering of the object alone, by a camera rotated towards place(0)."""
     eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
     viewmat, distance = look_at(eye, shown.place.translation), float((eye - shown.place.translation).norm())
     focal = FOCAL * SIDE * distance / (1.4 * shown.place.scale)
@@ -80,7 +80,7 @@ def test_rotated_photo_equals_the_view_of_a_rotated_camera(scene, shown):
 
 
 def test_photos_as_taken_are_mapped_to_the_views(scene, photos, shown, tmp_path):
-    """The photos have a border around the view, which the stored intrinsics of the photo describe."""
+    """The photos have a border around the view, which their stored intrinsics describe."""
     border = 40
     for file in photos.iterdir():
         image = read_image(file)
@@ -102,7 +102,7 @@ def test_crop_without_photos_is_rendered(scene, shown):
 
 
 def test_crop_camera_is_the_first_camera_of_the_network(scene, shown):
-    """Points near the object's middle lie in the same pixels for the camera in the scene and for DiffSplat's first."""
+    """Points near the object's centre have the same pixels in the scene's camera and in DiffSplat's first camera."""
     eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
     middle = shown.place.translation
     up = (eye - middle)[2] / (eye - middle).norm()
@@ -118,7 +118,7 @@ def test_crop_camera_is_the_first_camera_of_the_network(scene, shown):
 def test_steep_and_cropped_views_are_not_chosen(scene, photos):
     cut = scene.cameras.viewmats.clone()
     others = [i for i in range(6) if i != 2]
-    cut[others, 0, 3] += 0.55  # cropped in all views but one
+    cut[others, 0, 3] += 0.55  # the object is cropped in all views but one
     off, own = replace(scene, cameras=replace(scene.cameras, viewmats=cut)), opaque_gaussians(scene, 1)
     assert crop_object(off, own, SIDE, photos).name == "2.jpg"
     for few in (scene.cameras[[6]], None):
@@ -132,7 +132,7 @@ def test_photos_of_another_scene_are_refused(scene, tmp_path):
 
 
 def test_upscaled_crop_is_the_restored_image_at_the_generators_size(scene, photos, shown):
-    """Restored at three times the size, then averaged; its camera and pose are those of the plain crop."""
+    """It is restored at three times the size and averaged; its camera and pose are those of the plain crop."""
     large, calls = crop_object(scene, opaque_gaussians(scene, 1), 3 * SIDE, photos), []
     tint = torch.tensor([0.0, 0.1, 0.2])
 

@@ -1,4 +1,4 @@
-"""Outlier removal."""
+"""Removal of outliers."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from tests.segment.tabletop import block, egg
 
 
 def with_floaters(body: Gaussians, count: int = 60) -> Gaussians:
-    """A body and stray Gaussians around it, alone or in pairs, as bad matches leave them."""
+    """A body with stray Gaussians around it, single or in pairs, as caused by wrong matches."""
     rng = torch.Generator().manual_seed(0)
     size = float((body.means.amax(0) - body.means.amin(0)).norm())
     out = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)

@@ -1,4 +1,4 @@
-"""The refine stage: outlier removal, completion, background filling."""
+"""The refine stage: removal of outliers, completion of objects, and filling of the background."""
 
 from dataclasses import replace
 
@@ -28,11 +28,11 @@ from tests.segment.tabletop import WOOD, block, coloured_gaussians, orbit_camera
 
 SIDES = (0.2, 0.16, 0.12)
 pytestmark = pytest.mark.usefixtures("device")
-REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
+REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # colours of two stripes by their y [m]
 
 
 def photographed() -> Scene:
-    """A red block as reconstructed from photos: without bottom, and without table under it."""
+    """A red block as reconstructed from photos: it has no bottom, and there is no table under it."""
     thing = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
     top = table_gaussians()
     hidden = (top.means[:, 0].abs() < SIDES[0] / 2) & (top.means[:, 1].abs() < SIDES[1] / 2)
@@ -42,7 +42,7 @@ def photographed() -> Scene:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_inpainting():
-    """One trial with fewer source patches, an eighth of the time; test_inpaint.py covers the full search."""
+    """One trial with fewer source patches takes 1/8 of the time; test_inpaint.py tests the full search."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inpaint, "TRIES", 1)
         patch.setattr(inpaint, "MAX_SOURCE_PATCHES", 2000)
@@ -60,7 +60,7 @@ def after(before, device) -> Scene:
 
 
 def seen(scene: Scene, eye: tuple, keep: int, target: tuple = (0.0, 0, 0)):
-    """Colours and alpha of the Gaussians of one object (0: the background) over the middle of a small view."""
+    """Mean colour and alpha of one object's Gaussians (0: the background) in the middle of a small view."""
     g = scene.gaussians[scene.gaussians.object_id == keep]
     viewmat = look_at(torch.tensor(eye), torch.tensor(target))
     drawn = rasterise(g, viewmat[None], intrinsics(64, 64, 200.0)[None], 64, 64)
@@ -71,7 +71,7 @@ def seen(scene: Scene, eye: tuple, keep: int, target: tuple = (0.0, 0, 0)):
 def test_bottom_is_closed_in_the_colour_of_the_sides(before, after):
     below = (0.05, 0.0, -0.6)
     outside = (0.0, 0.0, 0.06)
-    # before, one looks up into the block; its top is seen from inside, 0.12 higher than the bottom
+    # before, the block is open from below, and its top is seen from inside, 0.12 above the bottom
     bottom = after.gaussians.means[(after.gaussians.object_id == 1) & (after.gaussians.means[:, 2] < 0.02)]
     inner = (bottom[:, 0].abs() < 0.07) & (bottom[:, 1].abs() < 0.05)
     old = before.gaussians.means[before.gaussians.object_id == 1]
@@ -91,18 +91,19 @@ def test_table_under_an_object_is_filled_in_its_colour(before, after):
 
 
 def test_unlabelled_parts_under_an_object_are_replaced_by_table():
-    """A block stands on two rails, and what cameras saw between them lies on the table's plane in yellow and black."""
+    """A block stands on two rails; yellow and black stripes lie in the table's plane, visible between the rails."""
     top, rails = table_gaussians(), [block((0.0, y), (0.2, 0.02, 0.07), (0.8, 0.1, 0.1), 1) for y in (-0.07, 0.07)]
     body = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
     body = replace(body, means=body.means + torch.tensor([0, 0, 0.07]))
     hidden = (top.means[:, 0].abs() < 0.1) & (top.means[:, 1].abs() < 0.08)
     left = [coloured_gaussians(sheet(0.2, 0.07, 0.012).moved((0.0, y, 0.0)), rgb, 0) for y, rgb in REMAINS.items()]
     scene = scene_of(top[~hidden], body, *rails, *left)
-    high, low = orbit_cameras(12, elevation=50.0), orbit_cameras(2, elevation=20.0)  # the low ones look along the rails
+    # the low cameras see along the rails
+    high, low = orbit_cameras(12, elevation=50.0), orbit_cameras(2, elevation=20.0)
     fields = [torch.cat([getattr(high, f), getattr(low, f)]) for f in ("viewmats", "Ks", "sizes")]
     scene = replace(scene, cameras=Cameras(*fields, tuple(f"{i}.jpg" for i in range(14))))
     weight = ObservedSpace.of(scene).weight[-2 * len(left[0].means) :]
-    assert float((weight > 1).float().mean()) > 0.3  # many of them are seen, between the rails
+    assert float((weight > 1).float().mean()) > 0.3  # many stripe Gaussians are visible between the rails
     refined = refine(scene, RefineOptions(completer="none"))
     for y, rgb in REMAINS.items():
         above, target = (0.07, y, 1.0), (0.05, y, 0.0)
@@ -112,7 +113,7 @@ def test_unlabelled_parts_under_an_object_are_replaced_by_table():
 
 
 def test_labels_stay_where_cameras_see_them_and_what_none_sees_in_an_object_is_removed(before):
-    """A white sheet beside the block, as close as its own Gaussians are to each other, and stray ones inside it."""
+    """A white sheet is as close to the block as the block's Gaussians are to each other; white strays are inside it."""
     sheet_ = block((SIDES[0] / 2 + 0.008, 0.0), (0.004, 0.1, 0.1), (0.9, 0.9, 0.9), 0)
     inside = ball((0.0, 0.0, 0.05), 0.02, 200, (0.9, 0.9, 0.9), 0)
     scene = replace(before, gaussians=concatenate([before.gaussians, sheet_, inside]))
@@ -127,7 +128,7 @@ def test_labels_stay_where_cameras_see_them_and_what_none_sees_in_an_object_is_r
 
 
 def test_table_is_filled_where_a_large_gaussian_is_removed(before):
-    # beneath the block three wide yellow Gaussians in one place, and many small ones beside it
+    # beneath the block are three wide yellow Gaussians at one position, and beside it many small ones
     small = coloured_gaussians(sheet(0.05, 0.12, 0.01).moved((-0.06, 0.0, 0.0)), (0.8, 0.7, 0.1), 0)
     wide = replace(small[:3], means=torch.tensor([[0.03, 0.0, 0.0]]).repeat(3, 1), opacities=torch.full((3,), 0.999))
     wide = replace(wide, scales=torch.tensor([[0.05, 0.05, 0.002]]).repeat(3, 1))
@@ -139,7 +140,7 @@ def test_table_is_filled_where_a_large_gaussian_is_removed(before):
 
 
 def test_contact_shadow_is_removed(before):
-    """All around the block, where it stands, a contact shadow lies on the table, in plain sight of the cameras."""
+    """A contact shadow lies on the table all around the block, where the cameras see it."""
     g = before.gaussians
     beside = (g.means[:, 0].abs() < SIDES[0] / 2 + 0.015) & (g.means[:, 1].abs() < SIDES[1] / 2 + 0.015)
     shadow = beside & (g.object_id == 0) & (g.means[:, 2].abs() < 0.005)
@@ -159,7 +160,7 @@ def test_table_is_filled_without_cameras():
 
 
 def test_table_is_not_extended_beyond_its_edge():
-    """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
+    """A block stands at the inner corner of an L-shaped table; beyond the edge, cameras see the floor."""
     top = table_gaussians()
     floor = coloured_gaussians(sheet(2.0, 2.0, 0.03).moved((0.0, 0.0, -0.4)), (0.3, 0.3, 0.35), 0)
     thing = block((-0.04, -0.04), (0.08, 0.08, 0.1), (0.1, 0.2, 0.8), 1)
@@ -173,7 +174,7 @@ def test_table_is_not_extended_beyond_its_edge():
 
 
 def passes(eyes: torch.Tensor, places: torch.Tensor, grown: float) -> torch.Tensor:
-    """(c, n): whether the line from each eye to each place misses the block, by the method of slabs."""
+    """(c, n): whether the line from each eye to each place misses the block, grown by a margin (slab method)."""
     low = torch.tensor([-SIDES[0] / 2, -SIDES[1] / 2, 0.0]) - grown
     high = torch.tensor([SIDES[0] / 2, SIDES[1] / 2, SIDES[2]]) + grown
     ahead = places[None] - eyes[:, None]
@@ -182,7 +183,7 @@ def passes(eyes: torch.Tensor, places: torch.Tensor, grown: float) -> torch.Tens
 
 
 def test_visible_fraction_equals_ray_casting(before, device):
-    """Beside the block a place is seen by those cameras that it does not stand in the way of."""
+    """A place beside the block is visible to the cameras whose line of sight the block does not cross."""
     places = 0.36 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.18
     places[:, 2] = 0.0
     places = places[((places[:, 0].abs() > 0.13) | (places[:, 1].abs() > 0.11))]
@@ -205,7 +206,7 @@ def test_large_discs_are_hidden_only_behind_a_surface(device):
     viewmats, Ks = look_at(eye, torch.zeros(1, 3)), intrinsics(200, 200, 300.0)[None]
     scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
     weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200).weight
-    assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
+    assert float(weight[-1]) > 0.3  # [px]; a small contribution to each of many pixels
     assert ObservedSpace.of(scene, device).is_hidden(fur, wide).tolist() == [True, False]
 
 
@@ -214,7 +215,7 @@ def test_views_of_the_photos_are_unchanged(before, after, device):
 
 
 def test_object_in_a_dent_is_not_covered():
-    """A plate lower than the table around it, as on a soft seat; where it lay there is table still, below it."""
+    """A plate is lower than the table around it, as on a soft seat; the table is filled below it."""
     top = table_gaussians()
     plate = coloured_gaussians(sheet(0.25, 0.2, 0.006).moved((0.0, 0.0, -0.03)), (0.1, 0.2, 0.8), 1)
     hidden = (top.means[:, 0].abs() < 0.13) & (top.means[:, 1].abs() < 0.105)
@@ -311,7 +312,7 @@ def test_unknown_completer_is_refused(before):
 
 
 def test_wall_behind_an_object_is_filled(before):
-    # the block and its table rotated by 90 degrees about x: up becomes -y; without a floor
+    # the block and its table, rotated by 90 degrees about x, so that up becomes -y, and without a floor
     turn = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.zeros(3))
     gaussians, cameras = transformed(before.gaussians, turn), before.cameras.transformed(turn)
     hung = replace(before, gaussians=gaussians, cameras=cameras, floor=None)
@@ -322,4 +323,4 @@ def test_wall_behind_an_object_is_filled(before):
     assert alpha > 0.95 and float((colour / alpha - torch.tensor(WOOD)).abs().max()) < 0.05
     assert done.floor is None and torch.equal(done.cameras.viewmats, hung.cameras.viewmats)
     kept = done.gaussians.means[: len(hung.gaussians)]
-    assert float(knn(kept, hung.gaussians.means[::50], 1)[0].max()) < 1e-6  # rotated and back
+    assert float(knn(kept, hung.gaussians.means[::50], 1)[0].max()) < 1e-6  # the scene was rotated and rotated back

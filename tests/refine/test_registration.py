@@ -1,4 +1,4 @@
-"""Registration of parts to whole objects: exact without noise, within tolerance with it."""
+"""Registration of parts to whole objects: exact without noise, and within tolerances with noise."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def test_transformed_copy_is_registered(whole):
     assert found.fit > 0.97
 
 
-@pytest.mark.parametrize("number", [0, 1])  # cut, bitten
+@pytest.mark.parametrize("number", [0, 1])  # a cut and a bitten part
 def test_noisy_part_is_registered_within_tolerance(whole, number):
     given = make_trial(whole, number, RegisterBenchOptions())
     assert len(given.part) == round(0.6 * len(whole))
@@ -43,7 +43,7 @@ def test_noisy_part_is_registered_within_tolerance(whole, number):
 
 @pytest.mark.slow
 def test_brute_force_search_gives_the_same_registration(whole, monkeypatch):
-    monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # all pairs are slow on a CPU
+    monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # searching all pairs is slow on a CPU
     given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
     for module in (registration, registration_cloud):
@@ -58,7 +58,7 @@ def test_brute_force_search_gives_the_same_registration(whole, monkeypatch):
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
 def test_registration_on_a_gpu(whole):
     given = make_trial(whole, 1, RegisterBenchOptions())
-    near = given.truth._replace(scale=1.02 * given.truth.scale)  # on the CPU, as a camera would tell it
+    near = given.truth._replace(scale=1.02 * given.truth.scale)  # a hint on the CPU, such as from a camera
     for hints in ((), (near,)):
         found = register(given.part.to("cuda"), whole.to("cuda"), hints=hints).similarity
         assert found.rotation.is_cuda and found.translation.is_cuda
@@ -105,7 +105,8 @@ def test_fitted_poses_are_exact():
 
 
 def test_distinct_keeps_the_first_of_similar_poses():
-    turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))  # 0, 1, 33, 0 and 34 degrees
+    # rotations by 0, 1, 33, 0 and 34 degrees
+    turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))
     shift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
     kept = PoseHypotheses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, shift=0.05)
     assert kept.scale.tolist() == [0.0, 2.0, 3.0]

@@ -1,4 +1,4 @@
-"""The place of a whole object by matches of images: with matches by colour, and with the published networks."""
+"""Poses of whole objects by matching of images, with matches by colour and with the published networks."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from tests.segment.tabletop import coloured_gaussians
 
 
 class ColourFeatures:
-    """Replaces ALIKED: every fourth pixel that is not white, described by its colour."""
+    """Replaces ALIKED; every fourth pixel that is not white is a keypoint, described by its colour."""
 
     def keypoints_of(self, image, maximum, min_score):
         y, x = torch.nonzero((image < 0.99).any(-1), as_tuple=True)
@@ -30,7 +30,7 @@ class ColourFeatures:
 
 
 class NearestColour:
-    """Replaces LightGlue: pairs that are each other's nearest colours."""
+    """Replaces LightGlue; matches are mutually nearest colours."""
 
     def match(self, keypoints, descriptors, sizes):
         assert sizes[1] == (256, 256)
@@ -44,7 +44,7 @@ class NearestColour:
 
 
 def painted_egg() -> Gaussians:
-    """An egg whose colour is its position."""
+    """An egg whose colours equal its positions."""
     g = coloured_gaussians(ellipsoid((0.5, 0.35, 0.3), 6000), (0.5, 0.5, 0.5), 1)
     sh = g.sh.clone()
     sh[:, 0] = (0.5 + 0.8 * g.means - 0.5) / C0
@@ -52,7 +52,7 @@ def painted_egg() -> Gaussians:
 
 
 def seen_from(part: Gaussians, side: int = 256):
-    """The part alone on white from a camera that it nearly fills, at 20 degrees."""
+    """The part alone on white, from a camera at an elevation of 20 degrees whose image it almost fills."""
     centre = part.means.mean(0)
     size = float((part.means - centre).norm(dim=1).max())
     viewmat = look_at(centre + size * torch.tensor([2.6, 1.6, 1.1]), centre)
@@ -72,7 +72,7 @@ def test_points_of_a_view_are_on_the_object():
 
 @pytest.fixture
 def few_renderings(monkeypatch):
-    """24 instead of 90."""
+    """Use 24 renderings instead of 90."""
     monkeypatch.setattr(registration_matches, "YAWS", 12)
     monkeypatch.setattr(registration_matches, "PITCHES", (9.0, 27.0))
 
@@ -92,7 +92,7 @@ def test_ransac_ignores_wrong_matches_and_refuses_few():
     target = true(source)
     target[40:] = target[40:][torch.randperm(20, generator=rng)]
     found = ransac_similarity(source, target, seed=0)
-    # wrong matches within the limit, of 5 %, count
+    # wrong matches within the limit of 5 % count too
     assert found.scale == pytest.approx(true.scale, rel=0.01)
     assert degrees_between(found.rotation, true.rotation) < 1
     assert ransac_similarity(source[:5], target[:5], seed=0) is None
@@ -101,7 +101,7 @@ def test_ransac_ignores_wrong_matches_and_refuses_few():
 
 @pytest.mark.slow
 def test_the_published_networks_place_a_duck(device, monkeypatch):
-    monkeypatch.setattr(registration_matches, "YAWS", 30)  # 12 renderings instead of 90, each matched for a second
+    monkeypatch.setattr(registration_matches, "YAWS", 30)  # 12 renderings instead of 90; each is matched for a second
     monkeypatch.setattr(registration_matches, "PITCHES", (18.0,))
     try:
         matcher = load_matcher(device)

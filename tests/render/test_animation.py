@@ -20,10 +20,10 @@ def test_first_frame_equals_the_scene(tmp_path, two_balls):
 
 
 def test_stored_and_interpolated_frames_at_any_rate(tmp_path, two_balls):
-    animation = open_animation(rising(tmp_path / "t.h5", two_balls, frames=11))  # the balls rise 0.01 a frame
+    animation = open_animation(rising(tmp_path / "t.h5", two_balls, frames=11))  # the balls rise by 0.01 per frame
     assert animation.frame_times(None) == pytest.approx([0.02 * i for i in range(11)])
     assert animation.frame_times(25.0) == pytest.approx([0.04 * i for i in range(6)])
-    assert len(animation.frame_times(60.0)) == 13  # 0.2 s and the first frame
+    assert len(animation.frame_times(60.0)) == 13  # 0.2 s, and the first frame
     balls = two_balls.gaussians.object_id > 0
     for frame in (3, 4.5):
         moved = animation.gaussians(0.02 * frame).means - two_balls.gaussians.means
@@ -78,5 +78,5 @@ def test_arrows_start_at_the_point_of_application_while_the_force_acts(tmp_path,
     assert up[2] > 0.1 and up[:2].abs().max() == 0 and along[0] > 0 and along[1:].abs().max() < 1e-6
     torch.testing.assert_close(tail2, torch.tensor([0.42, 0.0, 0.43]), atol=1e-5, rtol=0)  # after rising for 3 frames
     radius_ratio = float(up[2] / along[0])
-    assert 2.0 < radius_ratio < 3.2  # half the force; ball radii 0.12 and 0.15
+    assert 2.0 < radius_ratio < 3.2  # half the force, and ball radii of 0.12 and 0.15
     assert force_arrows(replace(animation, trajectory=None), 0.06) == []

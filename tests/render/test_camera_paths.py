@@ -1,4 +1,4 @@
-"""Camera paths, and the subject that they frame."""
+"""Camera paths, and the subject that they show."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ BOX = Subject(torch.tensor([0.0, 0.0, 0.1]), torch.tensor([0.3, 0.3, 0.2]))
 
 
 def angles(a, b, about):
-    """Between the directions in which `about` sees the points a and b [degrees]."""
+    """Angles at `about` between the directions of points a and b [degrees]."""
     u, v = (torch.nn.functional.normalize(x - about, dim=1) for x in (a, b))
     return torch.rad2deg(torch.acos((u @ v.mT).clamp(-1, 1)))
 
@@ -146,7 +146,7 @@ def test_focus_of_converging_and_of_parallel_cameras(two_balls):
     np.testing.assert_allclose(found.centre.numpy(), [0, 0, 0.3], atol=1e-4)
     assert axes_focus(two_balls.cameras[[0, 0]]) is None  # a single axis has no unique focus
     line = two_balls.cameras[[0, 0, 0]]
-    line.viewmats[:, 0, 3] += torch.tensor([-0.1, 0.0, 0.1])  # side by side, looking the same way
+    line.viewmats[:, 0, 3] += torch.tensor([-0.1, 0.0, 0.1])  # next to each other, with the same viewing direction
     g = two_balls.gaussians
     assert axes_focus(line) is None
     assert common_view_centre(line, g[g.object_id > 0].means).centre[2] == pytest.approx(0.25, abs=0.15)
@@ -166,11 +166,11 @@ def test_object_far_from_the_focus_is_not_framed(two_balls):
 def test_aim_shifts_only_slightly_from_the_focus_towards_objects(two_balls):
     found = find_subject(Animation(replace(two_balls, cameras=ring(6, target=-0.4))))
     assert float(found.centre[2]) == pytest.approx(0.26, abs=0.05)
-    assert -0.2 < float(found.target[2]) < 0.0  # from -0.4 toward 0.26, as far as 0.35 of two thirds
+    assert -0.2 < float(found.target[2]) < 0.0  # 0.35 of two thirds of the way from -0.4 to 0.26
 
 
 def test_lifted_objects_are_in_the_image_from_the_first_frame(tmp_path, two_balls):
-    # the balls fall by 0.6 within a twentieth of the animation, to the focus of the cameras
+    # the balls fall by 0.6 within 1/20 of the animation, to the focus of the cameras
     animation = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = animation.trajectory.positions.clone()
     positions[:2, :, 2] += torch.tensor([[0.6], [0.3]])
@@ -183,14 +183,15 @@ def test_lifted_objects_are_in_the_image_from_the_first_frame(tmp_path, two_ball
 
 @pytest.mark.parametrize("jump", [(0.0, 0.0, 0.9), (0.5, -0.5, 0.0)], ids=["high up", "to the side"])
 def test_moving_objects_stay_in_the_image(tmp_path, two_balls, jump):
-    """Motion far above or beside the region of the photos, and back."""
+    """The objects move far above or beside the region of the photos, and back."""
     animation = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = animation.trajectory.positions.clone()
     positions += 4 * (torch.linspace(0, 1, 40) - torch.linspace(0, 1, 40) ** 2)[:, None, None] * torch.tensor(jump)
     animation = replace(animation, trajectory=replace(animation.trajectory, positions=positions))
     still = camera_path("novel", two_balls.cameras, find_subject(Animation(two_balls)), 40, 640)
     path = camera_path("novel", two_balls.cameras, find_subject(animation), 40, 640)
-    assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6  # MIN_FOCAL_FACTOR over the largest zoom
+    # MIN_FOCAL_FACTOR divided by the largest zoom
+    assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
         assert bool((depths(positions[i], path.viewmats[i]) > 0).all()) and bool(inside.all())

@@ -1,4 +1,4 @@
-"""Render --ids: object numbers at their places, and the legend."""
+"""Render --ids: numbers of objects at their positions, and the legend."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_each_number_is_drawn_at_its_object(tmp_path, two_balls):
     ids = visible_ids(two_balls.gaussians, two_balls.cameras, 0)
     for number in (1, 2):
         x, y = label_position((ids == number).numpy())
-        x, y = round(1.5 * x), round(1.5 * y)  # 96 px instead of the camera's 64
+        x, y = round(1.5 * x), round(1.5 * y)  # the image has 96 px instead of the camera's 64
         assert (image[y - 6 : y + 7, x - 6 : x + 7] > 0.9).all(2).any()
 
 

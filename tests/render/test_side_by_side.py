@@ -31,7 +31,7 @@ def height(image):
 
 @pytest.fixture
 def pair(tmp_path, two_balls):
-    """Two trajectories of one scene; in the second the balls rise twice as fast."""
+    """Two trajectories of one scene; the balls rise twice as fast in the second one."""
     steps = {"a": 0.02, "b": 0.04}
     return [rising(tmp_path / f"{name}.h5", two_balls, frames=5, step=step) for name, step in steps.items()]
 
@@ -51,7 +51,7 @@ def test_each_half_is_the_video_of_its_file(pair, capsys):
 
 
 def test_shared_camera_frames_both_motions(tmp_path, two_balls):
-    """Also in a moving view: at first both halves are equal except for the captions."""
+    """In a moving view, both halves are initially equal except for the captions."""
     calm = rising(tmp_path / "calm.h5", two_balls, frames=5, step=0.0)
     wild = rising(tmp_path / "wild.h5", two_balls, frames=5, step=0.07)
     frames = list(read_video(run([calm, wild], None, options(view="novel"))))
@@ -67,7 +67,7 @@ def test_captions_are_at_the_bottom(pair, tmp_path):
     left, right = sheet.chunk(2, 1)
     assert torch.equal(left[:70], plain[:70]) and torch.equal(right[:70], plain[:70])
     dark = [((half - 30 / 255).abs().amax(-1) < 0.01)[-12:, :20].float().mean() for half in (left, right)]
-    assert min(dark) > 0.3 and not torch.equal(left[-20:], right[-20:])  # a and b
+    assert min(dark) > 0.3 and not torch.equal(left[-20:], right[-20:])  # the captions are a and b
 
 
 def test_shorter_trajectory_holds_its_last_frame(tmp_path, two_balls):
@@ -82,12 +82,12 @@ def test_shorter_trajectory_holds_its_last_frame(tmp_path, two_balls):
 
 
 def test_different_frame_rates_are_synchronised(tmp_path, two_balls):
-    fast = rising(tmp_path / "fast.h5", two_balls, frames=9, step=0.01)  # 50 a second, 0.5 units/s
-    slow = rising(tmp_path / "slow.h5", two_balls, frames=5, step=0.02)  # the same motion at 25 a second
+    fast = rising(tmp_path / "fast.h5", two_balls, frames=9, step=0.01)  # 50 frames per second, 0.5 units/s
+    slow = rising(tmp_path / "slow.h5", two_balls, frames=5, step=0.02)  # the same motion at 25 frames per second
     with h5py.File(slow, "a") as file:
         file.attrs["dt"], file.attrs["fps"] = 0.04, 25.0
     frames = list(read_video(run([slow, fast], None, options(view="input:0", resolution=128))))
-    assert len(frames) == 9  # the higher rate
+    assert len(frames) == 9  # the higher frame rate is used
     for frame in frames:
         left, right = frame.chunk(2, 1)
         assert height(left) == pytest.approx(height(right), abs=0.4)
@@ -104,12 +104,12 @@ def test_scene_beside_trajectory_and_contact_sheet(tmp_path, two_balls, pair):
 
 
 def test_files_with_different_cameras_get_a_camera_each(tmp_path, two_balls, caplog):
-    """A scene and its copy under a similarity look the same from their own cameras."""
+    """A scene and its copy under a similarity transform look the same from their own cameras."""
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     moved = transformed_scene(two_balls, Similarity(2.0, turn, torch.tensor([3.0, 1, 0])))
     g = moved.gaussians
     quarter = torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]).expand_as(g.quats)
-    moved = replace(moved, gaussians=replace(g, quats=quarter))  # discs and balls: a rotation about z suffices
+    moved = replace(moved, gaussians=replace(g, quats=quarter))  # a rotation about z is sufficient for discs and balls
     files = [tmp_path / "here.ply", tmp_path / "there.ply"]
     for file, scene in zip(files, (two_balls, moved), strict=True):
         write_scene(file, scene)

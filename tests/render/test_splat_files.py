@@ -1,4 +1,4 @@
-"""GLB and SPZ: what other readers find is the scene, and the animation moves objects as skinning does."""
+"""GLB and SPZ files contain the scene when read by other programs, and animations move objects as skinning does."""
 
 import gzip
 import json
@@ -35,7 +35,7 @@ def scene(tmp_path):
 
 
 def write_motion(path, scene, frames=3):
-    """The motion of the test of the player, also as a file: the red ball is rigid, the green one is not."""
+    """The motion of the player's tests, also written to a file: the red ball is rigid, the green one is not."""
     motion = motion_of(scene, frames)
     info = SimulationInfo(motion.dt, (0.0, 0.0, 0.0), "test")
     with TrajectoryWriter(path, scene, info, motion.keypoints, motion.binding) as out:
@@ -45,7 +45,7 @@ def write_motion(path, scene, frames=3):
 
 
 def read_glb(path):
-    """The JSON of a GLB, and a function from the number of an accessor to its rows."""
+    """The JSON of a GLB, and a function that returns the rows of an accessor by its number."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack("<IIIII", data[:20])
     assert (magic, version, size, kind) == (0x46546C67, 2, len(data), 0x4E4F534A)
@@ -97,7 +97,7 @@ def test_glb_moves_rigid_objects_and_stores_the_frames_of_the_others(scene, tmp_
     moved = deform(scene.gaussians, motion.binding, motion.keypoints, motion.positions[t])
     truth = _y_up(moved[moved.object_id == 1])
     torch.testing.assert_close(local @ matrix(turn[[3, 0, 1, 2]]).T + shift, truth.means, rtol=0, atol=1e-4)
-    for time in (0.5, 1.5, 2.5, 3.5):  # frames
+    for time in (0.5, 1.5, 2.5, 3.5):  # times in frames
         shown = []
         for name in names[2:]:
             sampler = samplers[name, "scale"]
@@ -115,13 +115,13 @@ def test_spz_holds_the_scene_within_its_precision(scene, tmp_path):
     assert len(data) == 16 + n * (9 + 1 + 3 + 3 + 4 + 45)
     truth = _y_up(scene.gaussians)
     low, middle, high = np.frombuffer(data, np.uint8, 9 * n, 16).reshape(n, 3, 3).transpose(2, 0, 1).astype(np.int64)
-    position = ((low | middle << 8 | high << 16) ^ 1 << 23) - (1 << 23)  # signed
+    position = ((low | middle << 8 | high << 16) ^ 1 << 23) - (1 << 23)  # signed integers of 24 bits
     np.testing.assert_allclose(position / 4096, truth.means.numpy(), rtol=0, atol=1 / 8192 + 1e-6)
 
 
 @pytest.fixture
 def splat_transform():
-    """A function that converts a file by the program of that name, for which y is down in a PLY and up in others."""
+    """Function that converts a file with splat-transform, for which y is down in PLY files and up in others."""
     program = shutil.which("splat-transform")
     if program is None:
         pytest.skip("no splat-transform on this machine (npm install -g @playcanvas/splat-transform)")
@@ -129,7 +129,7 @@ def splat_transform():
 
 
 def y_down(g, x):
-    """The Gaussians of a scene with z up, with y down and the x axis in the same direction (1) or the opposite (-1)."""
+    """Gaussians of a scene with z up, converted to y down; the x axis is kept (x = 1) or reversed (x = -1)."""
     return transformed(_y_up(g), Similarity(1.0, torch.diag(torch.tensor([x, -1.0, -x])), torch.zeros(3)))
 
 
@@ -145,13 +145,13 @@ def test_splat_transform_reads_spz(scene, tmp_path, splat_transform):
 
 
 def test_splat_transform_writes_the_same_glb(scene, tmp_path, splat_transform):
-    """It writes GLB with KHR_gaussian_splatting, but reads none."""
+    """splat-transform can write but not read GLB with KHR_gaussian_splatting."""
     run(tmp_path / "scene.ply", tmp_path / "ours.glb", render_options())
     write_scene(tmp_path / "turned.ply", replace(scene, gaussians=y_down(scene.gaussians, -1.0)))
     splat_transform(tmp_path / "turned.ply", tmp_path / "theirs.glb")
     ours, theirs = (attributes(tmp_path / name) for name in ("ours.glb", "theirs.glb"))
     assert theirs.keys() <= ours.keys() and len(theirs) > 15
-    for name in theirs.keys() - {"COLOR_0"}:  # which they have in bytes
+    for name in theirs.keys() - {"COLOR_0"}:  # their colours are bytes
         values, found = theirs[name], ours[name]
         if name.endswith("ROTATION"):
             values, found = values[:, [3, 0, 1, 2]], found[:, [3, 0, 1, 2]]
@@ -160,13 +160,13 @@ def test_splat_transform_writes_the_same_glb(scene, tmp_path, splat_transform):
 
 
 def axes_like(quats, others):
-    """The axes of ellipsoids as columns, each in the direction nearer to that of the others."""
+    """The axes of ellipsoids as columns, with signs so that they are closest to those of `others`."""
     R = matrix(quats)
     return R * (R * matrix(others)).sum(1, keepdim=True).sign()
 
 
 def attributes(path):
-    """Those of the only primitive of a GLB."""
+    """The attributes of the only primitive of a GLB."""
     document, rows = read_glb(path)
     (primitive,) = document["meshes"][0]["primitives"]
     return {name: rows(number) for name, number in primitive["attributes"].items()}
@@ -205,7 +205,7 @@ def test_usd_core_reads_the_motion(scene, tmp_path):
     for id, name in ((0, "background"), (1, "object_1_red_ball"), (2, "object_2_green_ball")):
         prim, truth = stage.GetPrimAtPath(f"/scene/{name}"), moved[moved.object_id == id]
         assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
-        world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(2))  # of row vectors
+        world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(2))  # the matrix is for row vectors
         local = np.array(prim.GetAttribute("positions").Get(2))
         np.testing.assert_allclose(local @ world[:3, :3] + world[3, :3], truth.means.numpy(), rtol=0, atol=1e-4)
         quats = torch.tensor([[q.real, *q.imaginary] for q in prim.GetAttribute("orientations").Get(2)])
@@ -233,4 +233,4 @@ def test_a_folder_gets_a_ply_file_for_each_frame(scene, tmp_path):
     run(path, tmp_path / "last.ply", render_options(frame=-1, shadows="on"))
     last = read_scene(tmp_path / "last.ply").gaussians
     torch.testing.assert_close(last.means, truth.means, rtol=0, atol=1e-5)
-    assert not torch.equal(last.sh, truth.sh)  # shaded
+    assert not torch.equal(last.sh, truth.sh)  # it contains shadows

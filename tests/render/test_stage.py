@@ -1,4 +1,4 @@
-"""Stage render: videos, images and their options."""
+"""Stage render: videos, images and options."""
 
 import json
 import re
@@ -38,7 +38,7 @@ def render_image(source, out, **choices):
 
 
 def colour_fraction(image, colour, within=0.15):
-    """Fraction of the pixels within a distance of this colour."""
+    """Fraction of the pixels whose colour is within a distance of a given one."""
     return float(((image - torch.as_tensor(colour)).abs().amax(-1) < within).float().mean())
 
 
@@ -63,7 +63,7 @@ def test_moving_objects_move_and_the_floor_does_not(tmp_path, two_balls):
     frames = list(read_video(run(source, None, render_options(view="input:0", resolution=128))))
     heights = [float(rows_of(frame, GREEN)) for frame in frames]
     assert all(b < a - 0.5 for a, b in zip(heights, heights[1:], strict=False))
-    assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # floor in the foreground
+    assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # the floor in the foreground does not move
 
 
 def test_first_frame_equals_the_scene_at_rest(scene, trajectory, tmp_path):
@@ -73,7 +73,7 @@ def test_first_frame_equals_the_scene_at_rest(scene, trajectory, tmp_path):
 
 
 def test_shadows_are_drawn_once_an_object_moved_and_can_be_switched_off(two_balls, tmp_path):
-    """The red ball rises from the floor and shades it: only the floor, in grey, becomes darker."""
+    """The red ball rises from the floor and shades it; only the grey floor becomes darker."""
     source = rising(tmp_path / "traj.h5", two_balls, frames=6, step=0.04)
     view = {"view": "input:0", "resolution": 128}
     for frame in (0, 5):
@@ -119,7 +119,7 @@ def test_video_of_all_views_and_along_a_path(trajectory, tmp_path, two_balls):
     out = run(trajectory, None, render_options(view=str(tmp_path / "walk.json")))
     frames = list(read_video(out))
     assert out.name == "traj_walk.mp4" and frames[0].shape == (72, 96, 3)
-    assert (frames[0] - frames[5]).abs().mean() > 0.02  # another viewpoint
+    assert (frames[0] - frames[5]).abs().mean() > 0.02  # they have different viewpoints
 
 
 @pytest.mark.parametrize("view", ["novel", "orbit"])
@@ -144,7 +144,7 @@ def test_background_option_replaces_the_background(scene, tmp_path, two_balls):
     assert colour_fraction(behind[:, :20], (0.0, 0.0, 0.0), 0.01) > 0.9
     assert colour_fraction(behind[:, -20:], (1.0, 1.0, 1.0), 0.01) > 0.9
     g = two_balls.gaussians
-    floor = replace(g, sh=torch.full_like(g.sh, 10.0))[g.object_id == 0]  # white
+    floor = replace(g, sh=torch.full_like(g.sh, 10.0))[g.object_id == 0]  # the floor becomes white
     write_scene(tmp_path / "floor.ply", replace(two_balls, gaussians=floor, objects=()))
     other = render_image(scene, tmp_path / "o.png", view="input:0", background=str(tmp_path / "floor.ply"))
     assert colour_fraction(other, (1.0, 1.0, 1.0), 0.1) > 0.6 and colour_fraction(other, RED) > 0.005

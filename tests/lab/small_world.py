@@ -44,7 +44,7 @@ def box_shell(half: tuple[float, float, float], n: int = 150, seed: int = 0) -> 
 
 
 def shrink(setattr, setitem) -> None:
-    """Make the data set small, with setattr and setitem as of pytest's monkeypatch."""
+    """Make the data set small with the functions `setattr` and `setitem` of pytest's monkeypatch or equivalents."""
     for name, kind in list(OBJECTS.items()):
         setitem(OBJECTS, name, replace(kind, make="tests.lab.small_world:brick", E=min(kind.E, 1e5), scale=0.4))
     setitem(SCENE_COUNTS, "3_9", 2)
@@ -54,5 +54,5 @@ def shrink(setattr, setitem) -> None:
 
 
 def shrink_process() -> None:
-    """The same for a whole process, without undo."""
+    """Make the data set small for a whole process; it cannot be undone."""
     shrink(setattr, lambda table, key, value: table.__setitem__(key, value))

@@ -1,4 +1,4 @@
-"""Conversion of meshes: textured boxes, colours, glTF, parts, inverted faces, units, and invalid files."""
+"""Conversion of meshes: textured boxes, colours, glTF, parts, inverted faces, units and invalid files."""
 
 import sys
 
@@ -15,8 +15,9 @@ from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.meshes import read_mesh
 from stages.lab.assets.winding import winding_signs
 
-CORNERS = [(x, y, z) for z in (0, 1) for y in (0, 2) for x in (0, 2)]  # 2 x 2 x 1
-SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]  # -z +z -y +y -x +x
+CORNERS = [(x, y, z) for z in (0, 1) for y in (0, 2) for x in (0, 2)]  # corners of a box of 2 x 2 x 1
+# vertices of the sides: -z +z -y +y -x +x
+SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 PAINT = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 30], [30, 200, 200], [200, 30, 200]])
 NORMALS = torch.tensor([[0.0, 0, -1], [0, 0, 1], [0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0]])
 
@@ -27,7 +28,7 @@ def trimesh():
 
 
 def textured_box(folder):
-    """An OBJ box whose six sides have one colour each, from stripes of a texture."""
+    """An OBJ box whose six sides have the colours of stripes of a texture."""
     write_png(folder / "paint.png", torch.from_numpy(np.repeat(np.repeat(PAINT[None], 8, 1), 8, 0)).float() / 255)
     (folder / "box.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd paint.png\n")
     lines = ["mtllib box.mtl", "usemtl skin"]
@@ -42,7 +43,7 @@ def textured_box(folder):
 
 
 def side_of(g) -> torch.Tensor:
-    """Index of the side each centre lies on; -1 near an edge."""
+    """Index of the side on which each centre lies; -1 near an edge."""
     away = torch.stack([(g.means - n / 2 * torch.tensor([1.0, 1.0, 0.5])) @ n for n in NORMALS], 1).abs()
     nearest = away.sort(1)
     return torch.where(nearest.values[:, 1] > 0.02, nearest.indices[:, 0], -1)
@@ -62,12 +63,12 @@ def test_textured_box_keeps_size_and_colours(tmp_path):
         own = side == s
         torch.testing.assert_close(rgb(g)[own], torch.tensor(paint / 255.0).float().expand(int(own.sum()), 3),
                                    rtol=0, atol=0.004)  # fmt: skip
-        short_axis = matrix(g.quats[own])[:, :, 2]  # along the normal
+        short_axis = matrix(g.quats[own])[:, :, 2]  # the direction along the normal
         torch.testing.assert_close((short_axis @ NORMALS[s]).abs(), torch.ones(int(own.sum())), rtol=0, atol=1e-3)
 
 
 def test_gaussians_are_uniform_over_the_area(tmp_path):
-    """Top and bottom have half of the area of the six sides: 8 of 16."""
+    """Top and bottom have half of the total area: 8 of 16."""
     g = read_mesh(textured_box(tmp_path), 4000)
     flat = (g.means[:, 2].abs() > 0.249).float().mean()
     assert abs(float(flat) - 0.5) < 0.03
@@ -86,7 +87,7 @@ def test_baked_light_comes_from_above(tmp_path):
 
 
 def test_up_axis(tmp_path):
-    """With y up, y becomes z and z becomes -y."""
+    """In files with y up, y is converted to z and z to -y."""
     path = textured_box(tmp_path)
     z, y = read_mesh(path, 3000), read_mesh(path, 3000, up="y")
     torch.testing.assert_close(y.means[:, 2], z.means[:, 1], rtol=0, atol=1e-6)
@@ -95,7 +96,7 @@ def test_up_axis(tmp_path):
 
 @pytest.mark.parametrize("kind", ["vertex_colors", "face_colors"])
 def test_colours_of_vertices_and_faces(tmp_path, trimesh, kind):
-    """Vertices: red at the left, blue at the right, interpolated between. Faces: one colour each."""
+    """Vertex colours from red (left) to blue (right) are interpolated; faces have one colour each."""
     triangles = [t for a, b, c, d in SIDES for t in ((a, b, c), (a, c, d))]
     if kind == "vertex_colors":
         colours = [(255, 0, 0, 255) if x == 0 else (0, 0, 255, 255) for x, _, _ in CORNERS]
@@ -114,7 +115,7 @@ def test_colours_of_vertices_and_faces(tmp_path, trimesh, kind):
 
 
 def test_gltf_is_y_up_and_its_scene_graph_is_applied(tmp_path, trimesh):
-    """Two unit boxes, one translated by 3 along y: total height 4, along z after the conversion."""
+    """Two unit boxes, one translated by 3 along y, have a total height of 4, along z after the conversion."""
     box = trimesh.creation.box((1, 1, 1))
     box.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(
         baseColorFactor=[51, 102, 204, 255]))  # fmt: skip
@@ -163,11 +164,11 @@ def test_real_meshes(shared, name):
     (path,) = (shared / "data/objects" / name).glob("*.obj")
     g = read_mesh(path, 5000)
     assert abs(len(g) - 5000) < 1000
-    assert rgb(g).std(0).max() > 0.02  # more than one colour
+    assert rgb(g).std(0).max() > 0.02  # it has more than one colour
 
 
 def obj_box(low=(0, 0, 0), sides=(1, 1, 1), start: int = 0, inverted: tuple[int, ...] = ()) -> list[str]:
-    """Lines of an OBJ box with its corner at `low`; `start` vertices precede it, some of its 6 faces are inverted."""
+    """Lines of an OBJ box with its corner at `low`, after `start` other vertices; some of its 6 faces are inverted."""
     v = [f"v {low[0] + sides[0] * x} {low[1] + sides[1] * y} {low[2] + sides[2] * z}"
          for z in (0, 1) for y in (0, 1) for x in (0, 1)]  # fmt: skip
     quads = [tuple(reversed(quad)) if i in inverted else quad for i, quad in enumerate(SIDES)]
@@ -178,11 +179,11 @@ def sides_of(g) -> list[float]:
     return (g.means.amax(0) - g.means.amin(0)).tolist()
 
 
-TWO = ((0, 0, 0), (1, 1, 1)), ((3, 0, 0), (1, 1, 1))  # two unit boxes, 4 long together, apart by 2
+TWO = ((0, 0, 0), (1, 1, 1)), ((3, 0, 0), (1, 1, 1))  # two unit boxes with a gap of 2, total length 4
 
 
 def two_boxes(folder, trimesh, kind: str):
-    """One object of two boxes, in the forms in which files store the parts of an object."""
+    """One object of two boxes, in the different forms in which files store its parts."""
     folder.mkdir()
     lines = [obj_box(*box, start=8 * i) for i, box in enumerate(TWO)]
     if kind in ("o", "g"):
@@ -217,7 +218,7 @@ def test_parts_are_one_object(tmp_path, trimesh, kind):
 
 
 def test_folders_are_searched_for_objects(tmp_path):
-    """Numbered parts are grouped, formats of one mesh are not repeated, different names stay different objects."""
+    """Numbered parts are grouped, other formats of a mesh are skipped, and different names are different objects."""
     names = ["mug/mug.obj", "mug/mug.stl", "chair/seat.obj", "chair/leg_1.obj", "chair/leg_2.obj", "bed/Part1.ply",
              "bed/Part2.ply", "bed/frame.001.ply", "bed/frame.ply", "flat/towel2.obj", "flat/towel3.obj", "n/1.obj",
              "n/2.obj", "n/.hidden.obj", "n/paint.png"]  # fmt: skip
@@ -240,7 +241,7 @@ def test_folders_are_searched_for_objects(tmp_path):
 @pytest.mark.parametrize("inverted", [(1,), (0, 2, 4), (0, 1, 2, 3, 4, 5)])
 @pytest.mark.parametrize("split", [False, True], ids=["shared", "split"])
 def test_inverted_faces_are_lit_as_right_ones(tmp_path, inverted, split):
-    """Also where each face has its own vertices."""
+    """In the second case each face has its own vertices."""
 
     def box(name, faces):
         lines = obj_box(inverted=faces)
@@ -261,7 +262,7 @@ def test_inverted_faces_are_lit_as_right_ones(tmp_path, inverted, split):
 
 
 def test_winding_of_open_and_twisted_surfaces():
-    """An open strip follows the larger part of its area; a Moebius strip is kept; distant parts are independent."""
+    """An open strip keeps the winding of most of its area, a Moebius strip its own; distant parts are independent."""
 
     def strip(n, twist, close):
         u = torch.linspace(0, 2 * torch.pi * (1 if close else 0.8), n + 1).double()
@@ -296,7 +297,7 @@ def test_open_meshes_and_sheets_are_read(tmp_path):
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1e9, 1e30])
 @pytest.mark.parametrize("at", [0.0, 1e4])
 def test_units_do_not_matter(tmp_path, size, at):
-    """Nor does the position: an object 10,000 of its sizes away from the origin."""
+    """The position does not matter either: one object is 10,000 times its size away from the origin."""
     (tmp_path / "box.obj").write_text("\n".join(obj_box((at * size,) * 3, (2 * size, size, size))))
     g = read_mesh(tmp_path / "box.obj", 1000)
     assert sides_of(g) == pytest.approx([1, 0.5, 0.5], abs=0.01) and g.scales.isfinite().all()
@@ -312,7 +313,7 @@ def test_missing_textures_leave_the_colour_of_the_material(tmp_path):
 
 @pytest.mark.parametrize("corners", ["vt 0.25\nvt 0.25\nvt 0.25", "vt nan 0\nvt inf 0\nvt 3e38 0"])
 def test_odd_texture_coordinates_are_read(tmp_path, corners):
-    """OBJ allows one coordinate; those that are no place in the texture count as 0."""
+    """OBJ allows a single coordinate; coordinates outside any texture count as 0."""
     write_png(tmp_path / "paint.png", torch.tensor([0.8, 0.4, 0.2]).expand(4, 4, 3).contiguous())
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd paint.png\n")
     text = f"mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{corners}\nusemtl skin\nf 1/1 2/2 3/3\n"

@@ -1,4 +1,4 @@
-"""The ten objects (registry, size, sampling, hollowness, colours, files) and the fields they are sampled from."""
+"""The ten objects (registry, size, sampling, hollowness, colours, files) and the distance fields that define them."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ def full_size(name: str) -> Gaussians:
 
 @cache
 def made(name: str) -> Gaussians:
-    """An object scaled to longest side 1."""
+    """An object scaled so that its longest side is 1."""
     return scaled(name, full_size(name))
 
 
@@ -59,7 +59,7 @@ CLOSED = {
     "panda": 0.1,
     "phone": 0.1,
     "pillow": 0.2,
-}  # minimum fraction of the bounding box that is enclosed
+}  # minimum fraction of the bounding box that the object encloses
 
 
 def digest(g: Gaussians) -> str:
@@ -70,7 +70,7 @@ def digest(g: Gaussians) -> str:
 
 
 def regions(g: Gaussians, cells: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Masks on a grid of `cells` along the longest side: cells with Gaussians, outside cells, enclosed cells."""
+    """Masks of a grid with `cells` along the longest side: cells with Gaussians, outside cells, enclosed cells."""
     where = ((g.means.numpy() + 0.5) * cells).astype(int).clip(0, cells - 1) + 2
     shell = np.zeros((cells + 4,) * 3, bool)
     shell[tuple(where.T)] = True
@@ -111,7 +111,7 @@ def test_objects_are_flat_gaussians_in_a_unit_box(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gaussians_are_spread_evenly(name):
-    """The spacing of random points on a surface varies by 52 % (Rayleigh); that of the Gaussians by far less."""
+    """The spacing of random surface points varies by 52 % (Rayleigh), that of the Gaussians must vary much less."""
     g = made(name)
     nearest = knn(g.means, g.means, 2)[0][:, 1]
     assert nearest.std() / nearest.mean() < 0.3
@@ -130,8 +130,10 @@ def test_closed_objects_enclose_empty_space(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gaussians_lie_on_the_outer_surface(name):
-    """Each lies within two cells of the outside, except in gaps narrower than the cells (under the fringe, between
-    limbs, where the rope crosses itself)."""
+    """Each is within two cells of the outside, except in gaps narrower than the cells.
+
+    Such gaps are under the fringe, between limbs, and where the rope crosses itself.
+    """
     g = made(name)
     _, outside, _ = regions(g)
     skin = ndimage.binary_dilation(outside, iterations=3)
@@ -140,7 +142,7 @@ def test_gaussians_lie_on_the_outer_surface(name):
 
 
 def test_hollow_objects_are_shells(made_of_few):
-    """Ball: centres near the sphere, except groove and button. Can: no centre well inside."""
+    """The ball's centres are near the sphere, except in groove and button; no centre of the can is well inside it."""
     r = made("ball").means.norm(dim=1)
     assert (r > 0.44).all() and (r < 0.52).all()
     p = made_of_few("can").means
@@ -149,13 +151,13 @@ def test_hollow_objects_are_shells(made_of_few):
 
 @pytest.fixture
 def made_of_few(monkeypatch):
-    """Makes an object scaled to longest side 1, of a sixth of its Gaussians."""
+    """Function that returns an object scaled to longest side 1, with a sixth of its Gaussians."""
 
     def few(parts, half_extent, count, **how):
         return gaussians_from_parts(parts, half_extent, count // 6, **how)
 
     def make(name: str) -> Gaussians:
-        with monkeypatch.context() as patch:  # ends here: `made` keeps what it makes
+        with monkeypatch.context() as patch:  # the patch must end here, because `made` caches objects
             for module in (hard_objects, phone):
                 patch.setattr(module, "gaussians_from_parts", few)
             return scaled(name, make_object(name))
@@ -184,7 +186,7 @@ def test_cloth_is_a_thin_closed_sheet():
     sides = (column.amax(0) - column.amin(0)).sort().values
     assert sides[0] < 0.1 and sides[1] > 0.8
     column = column[(column[:, :2] - torch.tensor([0.1, -0.1])).norm(dim=1) < 0.01]
-    assert 0.004 < column[:, 2].max() - column[:, 2].min() < 0.03  # two layers, the thickness of the sheet apart
+    assert 0.004 < column[:, 2].max() - column[:, 2].min() < 0.03  # two layers, separated by the thickness of the sheet
 
 
 def test_ball_duck_and_panda_have_the_expected_colours(made_of_few):
@@ -229,7 +231,7 @@ def test_unknown_object_lists_the_names():
 
 
 def test_gaussian_widths():
-    """Default discs are 0.7 times the spacing wide and 0.15 times thick, as in the shipped example."""
+    """As in the shipped example, default discs have a width of 0.7 and a thickness of 0.15 x 0.7 times the spacing."""
     line = torch.arange(5) * 0.01
     points = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
     surface = Surface(points, torch.tensor([[0.0, 0, 1]]).repeat(25, 1))
@@ -299,15 +301,15 @@ def test_highlight_is_at_the_reflection_and_keeps_the_mean_colour():
     sh = add_highlight(torch.zeros(1, 1, 3), normal, torch.tensor([1.0]))
     views = torch.nn.functional.normalize(
         torch.randn(20_000, 3, generator=rng), dim=1
-    )  # from the surface to the camera
+    )  # directions from the surface to the camera
     seen = evaluate_sh(sh.expand(len(views), 9, 3), -views)[:, 0] - 0.5
     reflected = 2 * (normal @ KEY_LIGHT) * normal[0] - KEY_LIGHT
     assert float(views[seen.argmax()] @ reflected) > 0.99
-    assert abs(float(seen.mean())) < 0.01  # 20,000 directions of spread 0.15: 0.001
+    assert abs(float(seen.mean())) < 0.01  # the error of 20,000 directions with spread 0.15 is 0.001
 
 
 def test_command_writes_the_published_layout(tmp_path, monkeypatch):
-    monkeypatch.setattr("stages.lab.assets.objects.make_object", full_size)  # made once
+    monkeypatch.setattr("stages.lab.assets.objects.make_object", full_size)  # the object is cached
     done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--sheet", str(tmp_path / "sheet.jpg")])
     assert done.exit_code == 0, done.output
     assert "duck: 50000 Gaussians" in done.output

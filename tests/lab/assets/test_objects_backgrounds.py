@@ -33,14 +33,14 @@ def test_table_top_is_dense_with_free_space_above(name):
     over_table = (g.means[:, :2].abs() < 1.9).all(1)
     assert not (g.means[over_table, 2] > -0.94 + 1e-5).any()
     top = top_of(g).means[:, :2]
-    counts = np.histogram2d(*top.T.numpy(), bins=np.linspace(-1.9, 1.9, 39))[0]  # squares of 0.1
+    counts = np.histogram2d(*top.T.numpy(), bins=np.linspace(-1.9, 1.9, 39))[0]  # counts in squares of side 0.1
     disc = np.hypot(*np.meshgrid(np.linspace(-1.85, 1.85, 38), np.linspace(-1.85, 1.85, 38))) < 2.2
-    assert counts[disc].min() > 12  # 0.01 m^2 holds 21 at a spacing of 0.0235
+    assert counts[disc].min() > 12  # 0.01 m^2 contains 21 at a spacing of 0.0235
 
 
 @pytest.mark.parametrize("name", ["table1", "table2"])
 def test_background_fills_every_view_of_the_data_set(name):
-    """Hardly a pixel is transparent in views from inside the room."""
+    """Hardly any pixel is transparent in views from inside the room."""
     g = background(name)
     viewmats = orbit(5, torch.tensor([0.0, 0.0, -0.3]), 4.0, 20.0)
     seen = rasterise(g, viewmats, intrinsics(96, 96, 144.0).expand(5, 3, 3), 96, 96).alpha
@@ -49,7 +49,7 @@ def test_background_fills_every_view_of_the_data_set(name):
 
 
 def test_tops_are_distinct():
-    """Mean colours or the spread of brightness differ between any two."""
+    """Any two have different mean colours or spreads of brightness."""
     looks = []
     for name in NAMES:
         rgb = top_of(background(name)).sh[:, 0] * C0 + 0.5

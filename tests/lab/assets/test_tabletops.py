@@ -32,7 +32,7 @@ COLOURS = {name: rgb for name, rgb in zip(
 
 
 def simple_object(name: str) -> Gaussians:
-    """A centred block with longest side 1 instead of the object."""
+    """A centred block with longest side 1 that replaces the object."""
     g = block((0.0, 0.0), (1.0, 0.8, 0.7), COLOURS[name], 1, spacing=0.05)
     return replace(g, means=g.means - torch.tensor([0, 0, 0.35]))
 
@@ -90,7 +90,7 @@ def test_scenes_are_deterministic():
 def test_best_iou_of_each_object():
     truth = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0])
     found = torch.tensor([3, 3, 3, 0, 3, 5, 5, 0])
-    # object 1: 3 of (4 + 4 - 3) with label 3; object 2: 1 of 3 with label 5, 1 of 5 with label 3
+    # IoUs: object 1 has 3 / (4 + 4 - 3) with label 3; object 2 has 1 / 3 with label 5 and 1 / 5 with label 3
     assert bench_segment.best_ious(found, truth) == pytest.approx({1: 3 / 5, 2: 1 / 3})
     assert bench_segment.best_ious(torch.zeros(8, dtype=torch.int64), truth) == {1: 0.0, 2: 0.0}
 
@@ -112,13 +112,13 @@ def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path,
 @pytest.mark.slow
 def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # one of three
     monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
-    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # one instead of four
     monkeypatch.setattr(bench_segment, "tabletop", cache(tabletop))
 
     def perfect(photos, out, options):
-        """The scene itself, transformed, without labels, with all cameras but the first."""
+        """Write the scene itself, transformed, without labels and without the first camera."""
         assert len(list(photos.iterdir())) == 8
         scene = bench_segment.tabletop("apart", 0, 8)
         move = Similarity(
@@ -160,10 +160,10 @@ def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
 
 def test_label_errors_have_the_given_rate():
     rng = np.random.default_rng(0)
-    truth = torch.arange(10).repeat_interleave(30).expand(50, 300)  # ten stripes, 30 pixels wide
+    truth = torch.arange(10).repeat_interleave(30).expand(50, 300)  # ten stripes with a width of 30 pixels
     assert torch.equal(bench_segment.corrupt_labels(truth, 0.0, 9, rng), truth)
     right = [float((bench_segment.corrupt_labels(truth, 0.3, 9, rng) == truth).float().mean()) for _ in range(30)]
-    # 0.7 keep their object, and 0.7 of its pixels (a tenth of the noise is right); shifts cost the rest
+    # 0.7 of the masks keep their object and 0.7 of their pixels (a tenth of the noise is right); shifts cost the rest
     assert 0.2 < np.mean(right) < 0.7 * 0.73 + 0.1
     assert int(bench_segment.corrupt_labels(truth, 1.0, 9, rng).max()) <= 9
 
@@ -173,7 +173,7 @@ def test_filled_hole_is_closer_to_the_truth_than_an_open_one():
     row = bench_refine.measure(0, views=8)
     assert row["pixels"] > 500
     assert row["after_db"] > row["before_db"] + 6
-    assert row["elsewhere_db"] > 32  # the border of the hole
+    assert row["elsewhere_db"] > 32  # the difference is the border of the hole
 
 
 @pytest.mark.parametrize("wrong", [{"scenes": 0}, {"views": 3}])

@@ -33,7 +33,7 @@ def data(tmp_path):
 
 
 def colliding() -> InitialConditions:
-    """Two balls of points that fly into each other, far from floor and walls."""
+    """Two balls of points that collide, far from floor and walls."""
     rng = torch.Generator().manual_seed(0)
     ball = 0.1 * torch.nn.functional.normalize(torch.randn(2, 48, 3, generator=rng), dim=-1)
     points = ball + torch.tensor([[-0.12, 0.0, 0.3], [0.12, 0.0, 0.3]])[:, None]
@@ -43,7 +43,7 @@ def colliding() -> InitialConditions:
 
 
 def stepped(name: str, world: InitialConditions) -> tuple[torch.Tensor, torch.Tensor]:
-    """Velocities of the bodies after a step, and the gradient of their squares for Young's modulus."""
+    """Velocities of the bodies after a step, and the gradient of their sum of squares by Young's modulus."""
     torch.manual_seed(0)
     model = ABLATIONS[name].network().eval()
     E = world.E.clone().requires_grad_()
@@ -84,7 +84,7 @@ def test_rigid_bodies_keep_their_shape():
 
 
 def test_impulses_are_the_last_contact_features():
-    """The removed features are the impulses that stop a contact pair, or separate it at 1 m/s."""
+    """The removed features are the impulses that stop a pair in contact, or separate it at 1 m/s."""
     world = colliding()
     shape = rest_shape_of(world)
     model = ABLATIONS["full"].network()

@@ -1,4 +1,4 @@
-"""The appearance benchmark: gsplat's recipe trains, from the right points, for the right time."""
+"""The appearance benchmark: gsplat's recipe is trained from the right points and for the right time."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ gsplat = pytest.importorskip("gsplat")
 
 
 def draw(means, quats, scales, opacities, sh, viewmats, Ks, width, height, sh_degree, packed):
-    """gsplat.rasterization on a CPU. `means2d` is a zero offset of each projected centre, for its gradient."""
+    """Replaces gsplat.rasterization on a CPU; `means2d` is a zero offset of each projected centre, for its gradient."""
     moves = torch.zeros(1, len(means), 2, requires_grad=True)
     z = (means.detach() @ viewmats[0, 2, :3] + viewmats[0, 2, 3]).clamp_min(0.01)
     world = (moves[0] * (z / Ks[0, 0, 0])[:, None]) @ viewmats[0, :2, :3]
@@ -34,7 +34,7 @@ def draw(means, quats, scales, opacities, sh, viewmats, Ks, width, height, sh_de
 
 
 def photographed(count: int = 6) -> tuple[Views, torch.Tensor]:
-    """A block on a table from an arc of cameras, and surface points of some pixels."""
+    """Photos of a block on a table from an arc of cameras, and surface points of some pixels."""
     cameras = arc(count, size=(80, 60))
     images, points = [], []
     for i in range(count):
@@ -48,9 +48,9 @@ def photographed(count: int = 6) -> tuple[Views, torch.Tensor]:
 
 
 def test_recipe_fits_photos_and_densifies():
-    """The start of a schedule of 1,500 steps: a higher SH degree every 50 steps, densification from step 30 on.
+    """The start of a schedule of 1,500 steps: the SH degree increases every 50 steps, densification begins at step 30.
 
-    On the CPU, since `draw` stands in for gsplat's rasteriser where there is no GPU.
+    It runs on the CPU, because `draw` replaces gsplat's rasteriser where there is no GPU.
     """
     torch.manual_seed(0)
     views, points = photographed()
@@ -81,7 +81,8 @@ def test_points_are_coloured_from_training_photos():
     half = Similarity(0.5, torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
     upright = Views(views.images, views.cameras.transformed(half))
     found, colours = bench.coloured_points(model, half, upright[[0, 2]], [0, 2])
-    torch.testing.assert_close(found, half(points[view != 1]))  # only the photo kept out shows the others
+    # the other points are visible only in the excluded photo
+    torch.testing.assert_close(found, half(points[view != 1]))
     true = torch.cat([_colours(views, i, points[view == i]) for i in (0, 2)])
     assert float((colours - true).abs().max()) < 1e-5
 
@@ -93,7 +94,7 @@ def _colours(views: Views, i: int, points: torch.Tensor) -> torch.Tensor:
 
 
 def test_gsplat_steps_match_our_time(monkeypatch, device):
-    """With a clock that a step advances by 10 ms in the first half of the schedule and 40 ms in the second."""
+    """A simulated clock advances by 10 ms per step in the first half of the schedule and by 40 ms in the second."""
     clock = [0.0]
     monkeypatch.setattr(bench.time, "perf_counter", lambda: clock[0])
 

@@ -1,4 +1,4 @@
-"""The chain's benchmark, with small functions in the place of the stages."""
+"""The chain's benchmark, with small functions instead of the stages."""
 
 import json
 import threading
@@ -19,7 +19,7 @@ def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
         return {
             "reconstruct": lambda: write_scene(folder / "scene.ply", two_balls_scene()),
             "segment": lambda: write_scene(folder / "labelled.ply", two_balls_scene()),
-            "render": lambda: (folder / "film.mp4").write_text(folder.name),  # differs from run to run
+            "render": lambda: (folder / "film.mp4").write_text(folder.name),  # the file differs between runs
         }
 
     monkeypatch.setattr(chain, "stage_calls", calls)
@@ -32,7 +32,7 @@ def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
 
 
 def test_utilisation_is_that_of_the_current_gpu(monkeypatch):
-    """The thread that reads it has a current GPU of its own, which is GPU 0."""
+    """The thread that reads the utilisation has its own current GPU, which is GPU 0."""
     caller, asked, twice = threading.get_ident(), [], threading.Event()
 
     def utilization(gpu: int) -> int:
@@ -60,4 +60,4 @@ def test_functions_and_commands_are_the_same_stages(tmp_path, refine):
 
 def test_a_failing_command_is_named():
     with pytest.raises(InputError, match="(?s)ngff segment failed: .*No such option: --colour"):
-        chain._command_seconds(["segment", "--colour"])  # refused before the stage is imported
+        chain._command_seconds(["segment", "--colour"])  # the option is refused before the stage is imported

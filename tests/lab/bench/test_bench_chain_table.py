@@ -1,4 +1,4 @@
-"""The table of times, with small functions in the place of the stages, and once with the stages themselves."""
+"""The table of times, with small functions instead of the stages, and once with the real stages."""
 
 import json
 

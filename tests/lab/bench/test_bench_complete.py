@@ -1,4 +1,4 @@
-"""The completion benchmark: what cameras see, and the metrics of what is missing."""
+"""The completion benchmark: visible parts, and metrics of the missing parts."""
 
 import json
 
@@ -49,7 +49,8 @@ def test_missing_back_lowers_psnr_from_behind(true):
     assert psnr_behind(seen, true) < 25
     exact = visible_scene(true, CompleteBenchOptions(noise=0.0))
     kept = exact.gaussians.means[exact.gaussians.object_id > 0]
-    assert float(torch.cdist(kept[:50], true.gaussians.means).amin(1).max()) < 1e-3  # cdist rounds
+    # the tolerance is for rounding in cdist
+    assert float(torch.cdist(kept[:50], true.gaussians.means).amin(1).max()) < 1e-3
 
 
 def test_visible_fraction_does_not_depend_on_density():
@@ -62,7 +63,7 @@ def test_visible_fraction_does_not_depend_on_density():
 
 
 def test_results_have_each_scene_and_the_mean(tmp_path, monkeypatch):
-    """One scene has twice the other's value in every metric."""
+    """In one scene, every metric has twice the value of the other."""
 
     def measured(placed, folder, options):
         assert (folder / "library/duck.ply").exists()

@@ -53,14 +53,14 @@ NONE = DynamicsBenchOptions(keypoints=8, mpm=0)
 
 
 def group(name: str, by: float = 0.0) -> KeypointMotions:
-    """Two scenes of falling bodies, all displaced by `by`."""
+    """Two scenes of falling bodies, displaced by `by` [m]."""
     made = falling(2, 8, 3 if name == "heldout" else int(name[0]), seed=GROUPS.index(name))
     return replace(made, names=(f"{name} a", f"{name} b"), points=made.points + by)
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A data set of all groups, two scenes each."""
+    """A data set of all groups with two scenes each."""
     (tmp_path / "data").mkdir()
     for name in GROUPS:
         write_motions(tmp_path / "data" / f"{name}.h5", group(name), {})
@@ -84,7 +84,7 @@ def test_free_fall_is_exact_for_bodies_that_only_fall():
 
 
 def tumbling(seed: int = 0):
-    """Rigid bodies that rotate and translate; the last object of scene 0 is missing."""
+    """Rigid bodies that rotate and translate; scene 0 lacks its last object."""
     motions = without_last(falling(frames=6, n=20, seed=seed))
     rest = motions.points[:, 0]
     centre = rest.mean(2, keepdim=True)
@@ -105,14 +105,14 @@ def test_rigid_fit_of_rigid_bodies_is_exact():
 def test_rigid_fit_of_soft_bodies_is_optimal():
     motions = tumbling()
     noise = 0.02 * torch.randn(motions.points.shape, generator=torch.Generator().manual_seed(1))
-    noise[:, 0] = 0  # at rest they are as they are
+    noise[:, 0] = 0  # no noise in the rest shape
     soft = replace(motions, points=motions.points + noise * motions.present[:, None, :, None, None])
     fit = predict_rigid_fit(soft)
     rest, last = soft.points[1, 0, 0], fit[1, -1, 0]
     assert_close(torch.cdist(last, last), torch.cdist(rest, rest), rtol=0, atol=1e-4)
     error = (fit - soft.points).square().sum()
-    assert error < (motions.points - soft.points).square().sum()  # the motion before the noise was one of the choices
-    assert predict_rigid_fit(soft)[0, :, -1].abs().max() == 0  # padding
+    assert error < (motions.points - soft.points).square().sum()  # the fit includes the motion without noise
+    assert predict_rigid_fit(soft)[0, :, -1].abs().max() == 0  # the missing object
 
 
 def test_the_truth_has_no_error_and_full_correlation():
@@ -134,7 +134,7 @@ def test_metrics_do_not_depend_on_the_batch_size():
     world = motions.initial_conditions()
     expected = float(rmse(still(motions), motions.points, world.valid).mean())
     assert one["RMSE"] == pytest.approx(expected, rel=1e-3)
-    assert one["R"] == 0  # everything falls, nothing was said to
+    assert one["R"] == 0  # everything falls, but nothing is predicted to move
     gap = (motions.points - motions.points[:, :1]).norm(dim=-1).mean(-1)
     assert one["error by frame"][-1] == pytest.approx(float(gap[:, -1][motions.present].mean()), rel=1e-2)
     bears = motions.objects == 1
@@ -189,7 +189,7 @@ def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeyp
     for row in facts["rows"].values():
         assert list(row["splits"]) == list(SPLITS)
     assert facts["rows"][FREE_FALL]["splits"]["spatial"]["RMSE"] < 1e-3  # these bodies only fall
-    assert facts["rows"][NUDGED]["splits"]["temporal"]["RMSE"] == pytest.approx(1e-3, rel=0.06)  # kept to 0.1 mm
+    assert facts["rows"][NUDGED]["splits"]["temporal"]["RMSE"] == pytest.approx(1e-3, rel=0.06)  # stored to 0.1 mm
     assert facts["rows"][RIGID_FIT]["splits"]["6 objects"]["RMSE"] < 2e-4
     row = facts["rows"]["transformer"]
     assert row["seconds"] > 0 and row["card"]["minutes"] == 2.0 and row["parameters"] > 0
@@ -197,8 +197,8 @@ def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeyp
     assert facts["published, on other data"]["NGFF"]["spatial"] == [0.082, 0.326, 0.661]
     text = "\n".join(lines)
     assert text.index("transformer") < text.index("measured on other data") < text.index("Pointformer")
-    assert len({len(line) for line in lines if "other data" not in line}) == 1  # columns stand below each other
-    assert "[\n" not in out.read_text()  # a list of numbers is one line
+    assert len({len(line) for line in lines if "other data" not in line}) == 1  # columns are aligned
+    assert "[\n" not in out.read_text()  # lists of numbers are single lines
 
 
 def test_table_and_plots_from_results_alone(data, weights, tmp_path, monkeypatch):
@@ -231,7 +231,7 @@ def test_other_rows_of_the_same_scenes_are_kept(data, weights, tmp_path, monkeyp
     rows = json.loads(out.read_text())["rows"]
     assert list(rows) == list(before) and rows["transformer"] == before["transformer"]
     assert rows["gcn"]["card"]["minutes"] == 3.0
-    run(data, weights, out, replace(NONE, limit=1))  # other scenes: numbers of before would mislead
+    run(data, weights, out, replace(NONE, limit=1))  # previous numbers are for other scenes
     assert list(json.loads(out.read_text())["rows"]) == [FREE_FALL, RIGID_FIT, "gcn"]
     out.write_text("[]")
     with pytest.raises(InputError, match="results.json: holds no results"):
@@ -259,9 +259,9 @@ def test_the_best_value_of_each_split_and_metric_is_bold():
 
 @pytest.fixture
 def simulated(tmp_path, monkeypatch):
-    """One group of two scenes with a ball and a duck and their assets; one scene has objects far outside the domain.
+    """One group of two scenes with a ball and a duck, and their assets; one scene has objects far outside the domain.
 
-    Simulated on the CPU, whose sums are the same in every run, as are the resimulations that repeat it.
+    It is simulated on the CPU, where runs are exactly repeatable; so are the resimulations.
     """
     shapes = {0: (0.2, 0.2, 0.2), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
@@ -292,11 +292,12 @@ def test_estimated_materials_replace_the_true_ones(simulated):
 
 def test_resimulation_repeats_the_scenes(simulated, monkeypatch):
     data, things = simulated
-    monkeypatch.setattr(dynamics_baselines, "with_estimated_materials", lambda things: things)  # the true materials
+    # uses the true materials
+    monkeypatch.setattr(dynamics_baselines, "with_estimated_materials", lambda things: things)
     truth = split_scenes(data, "spatial", DynamicsBenchOptions(keypoints=20))
     again = Resimulation(data, ["3_9"], "cpu")(("b", "a"), 12, 20)
     result = evaluate_predictor(predict_from(again, 12), truth, batch=2)
-    assert result["RMSE"] < 1e-4  # positions are kept to 0.1 mm
+    assert result["RMSE"] < 1e-4  # positions are stored to 0.1 mm
 
 
 def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tmp_path, monkeypatch):
@@ -306,7 +307,8 @@ def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tm
     facts = json.loads((tmp_path / "r.json").read_text())
     row = facts["rows"][MPM_ESTIMATED]["splits"]["spatial"]
     assert list(facts["rows"])[2] == MPM_ESTIMATED and row["scenes left out"] == 0
-    start, later = row["error by object"]["duck"]  # kept to 0.1 mm; 20 times as soft, it lands otherwise
+    # stored to 0.1 mm; the estimate is 20 times as soft, so the duck lands differently
+    start, later = row["error by object"]["duck"]
     assert start < 1e-4 and later > 5e-4
     assert facts["scenes"] == {"spatial": 2}
 

@@ -1,4 +1,4 @@
-"""The benchmark of materials from motion: its scenes, its summary, and one scene from end to end."""
+"""The benchmark of materials from motion: its scenes, its summary, and one complete scene."""
 
 import math
 from types import SimpleNamespace
@@ -43,7 +43,7 @@ def test_stiffness_and_density_are_compared_relative_to_the_first_density():
         "density": math.log10(2 * true.density),
         "E": math.log10(2 * true.E),
         "friction": true.friction,
-    }  # the same motion
+    }  # doubling both density and E does not change the motion
     fit = SimpleNamespace(
         problem=SimpleNamespace(parameters=[SimpleNamespace(name=name, object_id=1) for name in names],
                                 materials={1: SimpleNamespace(density=2 * true.density)}),

@@ -1,4 +1,4 @@
-"""The benchmark of materials from films: its scenes, and one of them from end to end."""
+"""The benchmark of materials from films: its scenes, and one complete scene."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The MPM benchmark: same physics in the baseline, consistent figures. No speed is tested."""
+"""The MPM benchmark: the baseline has the same physics, and figures are consistent. Speed is not tested."""
 
 import math
 

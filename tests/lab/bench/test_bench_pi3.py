@@ -31,7 +31,7 @@ def test_report_has_a_line_per_view_count_and_baseline(splats, device):
 
 
 def test_out_of_memory_is_reported(monkeypatch, device):
-    """The scores of all token pairs exceed memory, then everything does."""
+    """First the scores of all token pairs exceed the memory, then everything does."""
 
     def table(*_):
         raise torch.OutOfMemoryError
@@ -48,7 +48,8 @@ def test_time_and_memory_are_measured(device):
     model = random_weights(Pi3(TINY)).to(device)
     few, many = (measure(model, n, 56, 8, device, 3) for n in (1, 40))
     assert few[0] > 0 and many[0] > 0
-    assert many[0] > few[0] if device == "cpu" else many[1] > few[1] > 0  # launches take most of the time on a GPU
+    # on a GPU, kernel launches take most of the time
+    assert many[0] > few[0] if device == "cpu" else many[1] > few[1] > 0
 
 
 def test_sizes_must_be_multiples_of_a_patch():

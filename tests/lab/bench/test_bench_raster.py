@@ -1,4 +1,4 @@
-"""The rasteriser benchmark and its baseline. No speed is tested."""
+"""The rasteriser benchmark and its baseline. Speed is not tested."""
 
 import json
 
@@ -12,7 +12,7 @@ from stages.lab.bench.speed_options import RasterBenchOptions
 
 
 def test_baseline_equals_the_rasteriser():
-    """Both share projection and sorting only; their adjoints are independent."""
+    """They have only projection and sorting in common; their adjoints are independent."""
     g, (viewmat, K) = random_gaussians(3000), view_camera(90)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     drawn = rasterise(g, viewmat[None], K[None], 90, 90)

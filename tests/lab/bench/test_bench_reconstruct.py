@@ -1,4 +1,4 @@
-"""Metrics of the reconstruction benchmark, on cameras with known errors."""
+"""Metrics of the reconstruction benchmark, for cameras with known errors."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from tests.reconstruct.raycast import arc, write_set
 
 
 def elsewhere(cameras: Cameras, seed: int = 0) -> Cameras:
-    """The same cameras in a rotated, translated and scaled world."""
+    """The same cameras in a world that is rotated, translated and scaled."""
     generator = torch.Generator().manual_seed(seed)
     R = matrix(torch.randn(4, generator=generator))
     return cameras.transformed(Similarity(0.3, R, torch.randn(3, generator=generator)))
@@ -32,20 +32,20 @@ def tilted(degrees: float) -> torch.Tensor:
 def test_a_similarity_is_no_pose_error():
     error = bench.pose_error(elsewhere(ring(8)), ring(8))
     assert error.cameras == 8
-    assert error.rotation_most < 0.05 and error.shift < 1e-3  # arc cosines of float32 matrices
+    assert error.rotation_most < 0.05 and error.shift < 1e-3  # the tolerance is for arc cosines of float32 matrices
 
 
 def test_rotation_and_position_errors_are_measured():
     true = ring(8)
     viewmats = true.viewmats.clone()
-    viewmats[2, :3] = tilted(1.0) @ viewmats[2, :3]  # 7 of the 28 pairs see it
+    viewmats[2, :3] = tilted(1.0) @ viewmats[2, :3]  # 7 of the 28 pairs are affected
     error = bench.pose_error(Cameras(viewmats, true.Ks, true.sizes, true.names), true)
     assert error.rotation < 0.05 and error.rotation_most == pytest.approx(1.0, abs=0.02)
     viewmats = true.viewmats.clone()
-    viewmats[0, :3, 3] += torch.tensor([0.0, 0.0, 0.04])  # 0.04 along its axis, and the ring is 3.6 across
+    viewmats[0, :3, 3] += torch.tensor([0.0, 0.0, 0.04])  # 0.04 along its axis; the diameter of the ring is 3.6
     shift = bench.pose_error(Cameras(viewmats, true.Ks, true.sizes, true.names), true).shift
     extent = float(torch.pdist(centres(true.viewmats)).max())
-    assert 0.5 < shift / (100 * 0.04 / 8**0.5 / extent) <= 1.0  # the alignment takes up a part of it
+    assert 0.5 < shift / (100 * 0.04 / 8**0.5 / extent) <= 1.0  # the alignment compensates for a part of the error
 
 
 def test_photos_are_matched_by_name():
@@ -69,7 +69,7 @@ def test_floor_error_is_relative_to_the_scene_size():
     true = ring(8)
     found = true.transformed(Similarity(2.0, torch.eye(3), torch.tensor([0.3, 0.1, 0.0])))
     _, height = bench.upright_error(found, true, floor=-0.1, true_floor=0.0)
-    size = 4 * math.cos(math.radians(25))  # twice the cameras' distance from their middle
+    size = 4 * math.cos(math.radians(25))  # twice the cameras' distance from their centre
     assert height == pytest.approx(100 * 0.05 / size, rel=1e-3)
 
 
@@ -108,7 +108,7 @@ def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch, device):
 
 def test_failures_have_a_row_and_matchers_separate_rows(tmp_path, monkeypatch, device):
     (tmp_path / "set").mkdir()
-    monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)  # a process is not needed to fail
+    monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)  # failures do not need a subprocess
     for matcher in ("sift", "aliked-lightglue"):
         options = bench.ReconstructBenchOptions(matcher=matcher)
         lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
@@ -127,10 +127,10 @@ def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch, devic
     row = json.loads((tmp_path / "r.json").read_text())["sets"][f"set, normal, {device}, cameras"]
     assert row["placed"] == row["photos"] == row["poses"]["cameras"] == 4 and "4/  4" in lines[1]
     assert row["poses"]["rotation"] < 0.5 and row["poses"]["shift"] < 2.0
-    assert set(row["seconds"]) == {"features", "matches", "model"}  # and nothing after them
+    assert set(row["seconds"]) == {"features", "matches", "model"}  # later steps are skipped
 
 
 def test_orbits_are_level():
-    """The reference of the tilt: an orbit's mean up axis."""
+    """An orbit's mean up axis is the reference for the tilt."""
     up = -orbit(8, torch.zeros(3), 2.0, 30.0)[:, 1, :3].mean(0)
     assert float(up[2] / up.norm()) > 0.9999

@@ -23,7 +23,7 @@ from tests.segment.tabletop import coloured_gaussians
 
 @pytest.fixture(scope="module")
 def can():
-    """A grey ellipsoid; `painted` has one side red."""
+    """A grey ellipsoid; the fixture `painted` has one red side."""
     return coloured_gaussians(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
 
 
@@ -81,7 +81,7 @@ def test_icp_corrects_small_rotations():
 
 @pytest.fixture
 def stand_in(monkeypatch):
-    """A module in place of splatreg that matches by colour and returns a 4x4 pose, model to observation."""
+    """Module that replaces splatreg; it matches by colour and returns a 4x4 pose, from model to observation."""
 
     def estimate_object_pose(model, observation, *, init, transform):
         assert (init, transform) == ("features", "sim3") and torch.get_num_threads() == 1

@@ -1,4 +1,4 @@
-"""The rollout benchmark. No speed is tested."""
+"""The rollout benchmark. Speed is not tested."""
 
 import json
 
@@ -20,7 +20,7 @@ def test_scene_has_contacts():
     end = rollout_stepwise(model, start, 40)[:, -1]
     fallen = start.points - end
     assert end.isfinite().all()
-    assert fallen[:, 2, :, 2].mean() > 0.3  # the upper body has come down
+    assert fallen[:, 2, :, 2].mean() > 0.3  # the upper body has fallen
     assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
@@ -53,7 +53,7 @@ def test_run_has_all_rows_and_keeps_those_of_another_device(tmp_path, monkeypatc
     assert [row["scenes"] for row in rows] == len(names) * [1] + len(names) * [2]
     assert all(row["processor_seconds"] > 0 for row in rows if device == "cpu" and "MPM" not in row["what"])
     assert all(0 < row["arithmetic"] < 1 for row in rows if row["what"].startswith("ngff, "))
-    assert rows[len(names) - 1]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
+    assert rows[len(names) - 1]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps per step
 
 
 def test_ratios_are_relative_to_the_published_model():

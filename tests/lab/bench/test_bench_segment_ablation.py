@@ -18,7 +18,7 @@ from tests.conftest import CliRunner
 
 
 def two_balls(seed: int) -> Example:
-    """A floor, and a red and a blue ball on it."""
+    """A red and a blue ball on a floor."""
     rng = torch.Generator().manual_seed(seed)
     ball = torch.nn.functional.normalize(torch.randn(400, 3, generator=rng), dim=1)
     up = torch.tensor([[0.0, 0, 1]]).expand(900, 3)

@@ -1,4 +1,4 @@
-"""Benchmark of segmentation on real photos: rows, files and errors, with ready scenes and simulated stages."""
+"""Benchmark of segmentation on real photos: rows, files and errors, with existing scenes and simulated stages."""
 
 import json
 
@@ -17,7 +17,7 @@ from tests.evaluate.test_labels import NAMES, SIZE, billboards, picture
 
 @pytest.fixture
 def sets(tmp_path):
-    """Photo sets `desk` and `shelf` with labels of one of two photos; a labelled scene of `desk`."""
+    """Photo sets `desk` and `shelf`, each with labels of one of two photos, and a labelled scene of `desk`."""
     truth = picture(a_1=(4, 4, 24, 24), b_2=(30, 4, 50, 24), c_3=(40, 30, 60, 40))
     for name in ("desk", "shelf"):
         (tmp_path / name / "images").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Estimates of materials, with a local test chat_server."""
+"""Estimates of materials by a model, with a local test server."""
 
 import base64
 import json
@@ -28,7 +28,7 @@ GOOD = {"duck": {"material": "rubber", "E": 3e5, "density": 300}, "ball": {"mate
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    """40 frames, the n-th of brightness n / 40."""
+    """A video of 40 frames; frame n has brightness n / 40."""
     path = tmp_path_factory.mktemp("video") / "v.mp4"
     with VideoWriter(path, 20.0) as out:
         for n in range(40):

@@ -1,4 +1,4 @@
-"""Textbook experiments: the rigid engine agrees with theory, and the bench keeps rows and writes a page."""
+"""Textbook experiments: the rigid engine agrees with theory; the benchmark stores rows and writes a page."""
 
 import json
 import math
@@ -23,13 +23,13 @@ QUICK = (
     "rocking/12deg",
     "bounce/friction=0.1 loss=0.02",
     "bounce/friction=0.5 loss=0.15",
-)  # what tests/simulate/test_rigid.py does not show in small
+)  # experiments that tests/simulate/test_rigid.py does not include in small form
 BOXES = [name for name in ALL if name.startswith("boxes/")]
 
 
 @pytest.fixture(autouse=True)
 def small_bodies(monkeypatch, request):
-    """Few particles, which decide on whether a body stands on the floor, and bodies half as fine as usual."""
+    """Use few particles, which only decide whether a body stands on the floor, and bodies of half the resolution."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
     if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
@@ -45,7 +45,7 @@ def test_a_box_on_a_slope_within_its_friction_creeps_no_faster_in_two_seconds_th
     creep = ALL["creep/15deg friction=0.3 loss=0.02"]
     short = replace(creep.runs[0], options={**creep.runs[0].options, "steps": 101})
     row = measure(replace(creep, runs=(short,)), "rigid", PhysicsBenchOptions())
-    assert abs(row["value"]) < (2 - 0.5) / (10 - 0.5)  # of the limit of 1e-4 sides from .5 to 10 s
+    assert abs(row["value"]) < (2 - 0.5) / (10 - 0.5)  # share of the limit of 1e-4 sides between 0.5 and 10 s
 
 
 def test_names_say_the_case_and_tolerances_exclude_failures():
@@ -57,14 +57,14 @@ def test_names_say_the_case_and_tolerances_exclude_failures():
 
 
 def test_a_slightly_leaning_block_turns_as_a_linear_pendulum_upside_down():
-    """slenderness - angle = (slenderness - start) cosh(p t), with p^2 = 3 g / (4 R) for small angles."""
+    """For small angles, slenderness - angle = (slenderness - start) cosh(p t), with p^2 = 3 g / (4 R)."""
     slender, p = math.atan2(0.01, 1.0), math.sqrt(0.75 * 9.81 / (math.hypot(0.01, 1.0) / 2))
     expected = slender - (slender - 0.005) * math.cosh(0.2 * p)
     assert leaning_angle(0.01, 1.0, 0.005, 0.2) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_thin_ladder_slides_as_a_rod():
-    """angle'' = -3 g / (2 length) cos(angle), of which the first integral is rate^2 = 3 g (sin(start) - sin(angle))."""
+    """angle'' = -3 g / (2 length) cos(angle), which integrates to rate^2 = 3 g (sin(start) - sin(angle))."""
     time, dt = 0.2, 1e-5
     angle = [ladder_angle(1.0, 0.0, 1.0, t) for t in (time - dt, time + dt)]
     rate = (angle[1] - angle[0]) / (2 * dt)
@@ -96,7 +96,7 @@ def test_auto_is_measured_with_the_engine_that_it_takes(tmp_path):
 
 
 def test_experiments_are_chosen_by_groups_and_patterns():
-    assert not any("," in name for name in ALL)  # which separates them in --only
+    assert not any("," in name for name in ALL)  # commas separate names in --only
     names = [e.name for e in chosen("roll, tower/3*")]
     assert names == ["roll/10deg", "roll/25deg", "tower/3 for 2s"]
     assert len(chosen("")) == len(ALL)

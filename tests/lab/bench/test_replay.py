@@ -1,4 +1,4 @@
-"""Replay of the public solver's recorded run."""
+"""Replay of a recorded run of the published solver."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from stages.lab.bench import replay
 from tests.conftest import SHARED
 
 RECORDING = SHARED / "facts" / "public_mpm" / "three_boxes.npz"
-ALL_HAVE_TOUCHED = 27  # frames; the last of the three boxes first touches something in frame 25
+ALL_HAVE_TOUCHED = 27  # [frames]; the last of the three boxes has its first contact in frame 25
 
 
 def small(frames: int = 3) -> dict[str, np.ndarray]:
-    """A box of eight in free fall, as the public solver would record it: gravity first, then motion."""
+    """A box of eight particles in free fall, as recorded by the published solver: gravity is applied before motion."""
     start = np.array([[2 + 0.01 * i, 2 + 0.01 * j, 1 + 0.01 * k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     steps = 200 * np.arange(frames)
     fallen = -5.0 * 1e-4**2 * steps * (steps + 1) / 2
@@ -33,16 +33,16 @@ def test_agrees_with_the_public_solver_through_first_contacts(device):
     ours = torch.stack(list(replay.simulate(data, ALL_HAVE_TOUCHED, device)))
     c = replay.compare(data, ours)
     assert c.contact == 16
-    assert float(c.particles[: c.contact].max()) < 1e-4  # free flight: rounding only
-    assert float(c.com.max()) < 0.01  # of the drop height
+    assert float(c.particles[: c.contact].max()) < 1e-4  # only rounding errors in free flight
+    assert float(c.com.max()) < 0.01  # relative to the drop height
     moved = (ours[-1] - ours[15]).norm(dim=1).max() / c.drop
-    assert float(moved) > 0.3  # the bodies did move
+    assert float(moved) > 0.3  # the bodies have moved
 
 
 def test_grid_nodes_match_the_public_solver(device):
     grid = replay.make_solver(small(), device).grid
     at = [(torch.tensor(list(grid.origin)) + 0.02 * torch.tensor(list(edge))) / 0.02 for edge in (grid.low, grid.high)]
-    torch.testing.assert_close(at[0], torch.full((3,), 2.0), rtol=0, atol=1e-4)  # the third node is the last held one
+    torch.testing.assert_close(at[0], torch.full((3,), 2.0), rtol=0, atol=1e-4)  # the third node is the last fixed one
     torch.testing.assert_close(at[1], torch.full((3,), 197.0), rtol=0, atol=1e-4)
 
 

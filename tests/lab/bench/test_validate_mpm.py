@@ -1,4 +1,4 @@
-"""The MPM solver against theory, at one setting of each diagram in stages/lab/results/mpm.md."""
+"""The MPM solver compared with theory, at one setting of each diagram in stages/lab/results/mpm.md."""
 
 import math
 
@@ -16,7 +16,7 @@ from stages.lab.bench.validate_mpm import OPEN_BOX, advance, particle_block, sub
 
 @pytest.mark.slow
 def test_a_pressure_pulse_travels_at_the_speed_of_sound():
-    # quadratic splines with 8 cells in its half width: dispersion of less than a percent
+    # with quadratic splines and 8 cells in its half width, dispersion is less than 1 %
     start, *_, end = validate.pressure_pulse()
     assert end[1] - start[1] == pytest.approx(end[2] - start[2], rel=0.01)
 
@@ -29,21 +29,21 @@ def test_the_frequency_of_a_bar_converges_with_the_square_of_the_spacing():
 
 @pytest.mark.slow
 def test_cantilever_sag_matches_timoshenko():
-    # four cells in its height; the clamp is soft by a part of a cell, and 1 % of the length is 4 % of the sag
+    # four cells in its height; the clamp is soft by a part of a cell, and 1 % of the length changes the sag by 4 %
     measured, exact = validate.cantilever_deflection(0.3)
     assert measured == pytest.approx(exact, rel=0.05)
 
 
 @pytest.mark.slow
 def test_sand_column_spread_matches_experiments():
-    # measured over many grains by Lube et al.; 6 cells in the radius, and the front is thinner than a cell
+    # measured by Lube et al. for many grains; here the radius has 6 cells, and the front is thinner than a cell
     measured, published = validate.sand_column_spread(0.6)
     assert measured == pytest.approx(published, rel=0.15)
 
 
 @pytest.mark.slow
 def test_sand_spread_grows_with_resolution_and_shrinks_with_substeps():
-    # transfers smooth thin flows, which is why tall columns spread less than published: strongest on coarse grids
+    # transfers smooth thin flows, so tall columns spread less than published, especially on coarse grids
     (coarse, published), (fine, _) = (
         validate.sand_column_spread(1.5, cells=3),
         validate.sand_column_spread(1.5, cells=4),
@@ -62,12 +62,12 @@ def test_motion_is_insensitive_to_the_substep():
 @pytest.mark.slow
 def test_momentum_drift_over_ten_thousand_steps():
     steps, linear, angular = validate.momentum_drift()[-1]
-    # rounding of 6e-8 a step: 6e-4 if always of one sign, 6e-6 if random
+    # rounding errors of 6e-8 per step add up to 6e-4 if all have the same sign, and 6e-6 if random
     assert steps == 10_000 and linear < 5e-5 and angular < 1e-4
 
 
 def test_stress_in_metal_is_limited_by_its_yield_strength():
-    """The largest von Mises stress in a block that is compressed by a tenth."""
+    """The largest von Mises stress in a block that is compressed by 10 %."""
     dx, strength = 0.05, 1e3
     plastic = (strength, 0.0, 0.0)
     p = particle_block((0.2, 0.2, 0.2), dx / 2, nu=0.3, viscosity=50.0, model=VON_MISES, plastic=plastic)

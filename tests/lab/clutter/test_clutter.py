@@ -1,4 +1,4 @@
-"""Scenes of clutter: at rest, labelled, the same from one seed; observations with noise; a short training."""
+"""Cluttered scenes: at rest, labelled, reproducible by their seed; noisy observations; a short training run."""
 
 import json
 from dataclasses import replace
@@ -28,18 +28,18 @@ from tests.conftest import random_gaussians
 
 pytest.importorskip("mujoco")
 PERFECT = Degradation(bend=0.0, fatten=0.0, drift=0.0, patch=8.0, grain=0.0, plain=0.0, holes=-1.0, merge=0.005)
-NUMBER = 26  # of a small scene
+NUMBER = 26  # number of a small scene
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A scene of a few things, with one part and with several."""
+    """A scene with few objects, of one part and of several parts."""
     return make_scene(NUMBER, Shelf((), 0), ClutterOptions(views=4))[0]
 
 
 @pytest.fixture(scope="module")
 def exact(scene):
-    """An observation without noise: surfels and the object of each."""
+    """An observation without noise: surfels, and the object of each."""
     return observed(scene, np.random.default_rng(0), PERFECT)
 
 
@@ -49,7 +49,7 @@ def test_things_rest_on_the_furniture_and_do_not_reach_into_each_other(scene):
     assert sorted(g.object_id.unique().tolist()) == [0, *(o.id for o in scene.objects)]
     for o in scene.objects:
         low = float(g.means[g.object_id == o.id, 2].min())
-        assert low > -0.01, o.name  # the table's top is z = 0
+        assert low > -0.01, o.name  # the top of the table is z = 0
     assert min(float(g.means[g.object_id == o.id, 2].min()) for o in scene.objects) < 0.02
 
 
@@ -90,10 +90,10 @@ def test_offsets_lead_to_the_middle_of_the_object(exact):
 
 @pytest.mark.slow
 def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
-    """Photos with cameras that a reconstruction can use; observations; weights that load and label a scene."""
+    """Photos and cameras can be reconstructed; observations are written; trained weights can label a scene."""
     options = ClutterOptions(count=1, views=4, size=96, first=6)
     assert len(list(run(tmp_path / "photos", options))) == 1
-    assert not list(run(tmp_path / "photos", options))  # finished scenes are kept
+    assert not list(run(tmp_path / "photos", options))  # finished scenes are not generated again
     folder = tmp_path / "photos" / "0006"
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     assert all((folder / frame["file_path"]).is_file() for frame in frames)
@@ -129,7 +129,7 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
 
 
 def _with_fewer_score_features(weights: Path, out: Path) -> Path:
-    """A copy of weights whose scores of candidates take ten features."""
+    """A copy of weights whose candidate scores have ten features."""
     state = load_file(weights)
     for name in ("feature_mean", "feature_scale", "candidate_head.0.weight"):
         state[name] = state[name][..., :10].contiguous()
@@ -168,7 +168,7 @@ def test_large_objects_are_trained_on_at_reduced_size(monkeypatch, length):
 
 
 def test_objects_of_several_parts_rest_in_each_others_concavities():
-    """A block under the bridge of another object touches neither of its posts: parts collide, not convex hulls."""
+    """A block under the bridge of another object does not touch its posts: parts collide, not the convex hull."""
     from stages.lab.clutter.settle import settle
     from stages.lab.clutter.supports import Furniture, StaticBox
 
@@ -184,13 +184,13 @@ def test_objects_of_several_parts_rest_in_each_others_concavities():
 
 
 def test_things_rest_on_a_drape_where_its_gaussians_are():
-    """Blocks over the raised and over the low quadrant of a turned and shifted drape."""
+    """Blocks above the raised and the low quadrant of a rotated and shifted drape."""
     from stages.lab.clutter.drapes import CELLS, Drape
     from stages.lab.clutter.settle import settle
     from stages.lab.clutter.supports import Furniture, StaticBox, painted
 
     heights = torch.zeros(CELLS, CELLS)
-    heights[CELLS // 2 :, CELLS // 2 :] = 0.08  # y and x above the middle
+    heights[CELLS // 2 :, CELLS // 2 :] = 0.08  # the quadrant with x and y above the middle
     drape = Drape(heights, (0.4, 0.3), (0.1, -0.05), 0.7)
     floor = Furniture([StaticBox((0, 0, -0.05), (1, 1, 0.05))], [(-1, 1, -1, 1, 0)], (0, 6.28), (drape,))
     c, s = np.cos(0.7), np.sin(0.7)
@@ -251,7 +251,7 @@ def test_a_turned_box_is_drawn_where_things_rest_on_it():
     above = torch.tensor(block.centre) + R @ torch.tensor([0, 0, block.half[2] + 0.025])
     at, _ = settle(furniture, [[cube]], above[None].numpy())
     height = float(((torch.from_numpy(at[0]).float() - torch.tensor(block.centre)) @ R)[2])
-    assert abs(height - block.half[2] - 0.02) < 2e-3  # friction holds it on a slope of .3 rad
+    assert abs(height - block.half[2] - 0.02) < 2e-3  # friction holds it on a slope of 0.3 rad
 
 
 def test_seats_have_backs_behind_what_lies_on_them():

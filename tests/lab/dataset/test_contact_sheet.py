@@ -1,4 +1,4 @@
-"""The contact sheet: one row per scene, with visible motion along it."""
+"""The contact sheet: one row per scene, in which motion is visible."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from stages.lab.dataset import contact_sheet, generate
 from stages.lab.dataset.contact_sheet import SHEET_COLUMNS, SheetOptions, write_sheet
 from tests.lab.small_world import OPTIONS, shrink
 
-SIZE, CAPTION = 64, 20  # of an image, height of its caption [px]
+SIZE, CAPTION = 64, 20  # size of an image and height of its caption [px]
 
 
 def test_one_row_per_scene_from_first_to_last_frame(tmp_path, monkeypatch):

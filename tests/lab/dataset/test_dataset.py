@@ -1,4 +1,4 @@
-"""Sampling of scenes, their simulation, the files of keypoint trajectories, and the generator."""
+"""Sampling and simulation of scenes, the files of keypoint trajectories, and the generator."""
 
 import inspect
 import json
@@ -81,7 +81,7 @@ def test_groups_are_parsed_sampled_and_stored(tmp_path, extents, monkeypatch):
         3001,
         3300,
         3301,
-    ]  # no two groups share a scene
+    ]  # no two groups have a scene in common
     assert all(len(c.ids) == 3 for c in made)
     monkeypatch.setitem(SCENE_COUNTS, "4", 10)
     configs = sample_group("4", extents)
@@ -115,19 +115,21 @@ def test_objects_fall_freely_and_rest_on_the_floor(assets, device):
     com = made.points.mean(3)
     fallen = com[0, 0, 0, 2] - com[0, 12, 0, 2]
     assert float(fallen) == pytest.approx(5 / 2 * (12 * 0.02) ** 2, rel=0.02)
-    assert (com[1, -1, 0] - com[1, 0, 0]).norm() < 0.03  # rests on the floor
+    assert (com[1, -1, 0] - com[1, 0, 0]).norm() < 0.03  # it rests on the floor
     assert made.points[..., 2].min() > -0.94 - 0.5 * COARSE.dx
     assert float(made.mass[0, 0]) == pytest.approx(500 * float(assets[0].volume.sum()))
     initial = made.initial_conditions(50)
     assert initial.points.shape == (2, 2, 50, 3) and initial.present.tolist() == [[True, True], [True, False]]
 
 
-STIFF, LIGHT = 2e7, 200.0  # [Pa], [kg/m^3]: a wave speed of 367 m/s
+STIFF, LIGHT = 2e7, 200.0  # [Pa], [kg/m^3]: the wave speed is 367 m/s
 
 
 def falling_boxes(substep: float, device: str = "cpu", frames: int = 35) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two stiff light boxes without contact, one dropped from 0.4 m, one from 5 mm: positions (t, 2, p, 3) [m] and
-    energies per mass (t, 2) [m^2/s^2]; no frames if the simulation fails."""
+    """Two stiff light boxes without mutual contact, dropped from 0.4 m and from 5 mm.
+
+    Returns positions (t, 2, p, 3) [m] and energies per mass (t, 2) [m^2/s^2]; no frames if the simulation fails.
+    """
     half, discretisation = torch.tensor([0.2, 0.15, 0.1]), Discretisation(0.1, 0.05, substep)
     p = torch.cartesian_prod(*[torch.linspace(-h, h, round(h / 0.025) + 1) for h in half.tolist()])
     p = p[((p.abs() - half).abs() < 1e-5).any(1)]
@@ -142,7 +144,7 @@ def falling_boxes(substep: float, device: str = "cpu", frames: int = 35) -> tupl
 def test_stiff_light_boxes_fall_stay_intact_and_rest(device):
     substep = stable_substep(Discretisation(0.1, 0.05, 5e-4), [(1e4, 500.0), (STIFF, LIGHT)])
     x, energy = falling_boxes(substep, device)
-    t = 0.02 * torch.arange(14)  # before the floor acts, at a distance of about a cell
+    t = 0.02 * torch.arange(14)  # before the floor acts, which it does at a distance of about one cell
     fallen = (x[0] - x[:14])[:, 0, :, 2].mean(1)
     torch.testing.assert_close(fallen, 5 / 2 * t**2, rtol=0, atol=5 * 0.3 * substep + 1e-4)
     assert (energy.amax(0) < 1.01 * energy[0]).all()
@@ -167,7 +169,7 @@ def test_published_substep_is_kept_for_the_published_objects():
 
 
 def test_damping_per_second_does_not_depend_on_the_substep(device):
-    """The axial vibration of a bar, at the published substep and shorter ones."""
+    """The axial vibration of a bar, with the published substep and shorter ones."""
     x = torch.cartesian_prod(*[torch.arange(n) * 0.01 for n in (24, 4, 4)])
     x = x - x.mean(0)
     start = torch.zeros_like(x)
@@ -183,7 +185,7 @@ def test_damping_per_second_does_not_depend_on_the_substep(device):
         frames = batch.frames(21, 1e-3, round(1e-3 / substep), (0.0, 0.0, 0.0))
         mean = [(batch.solver.particles.v * velocity).sum() / velocity.square().sum() for _ in frames]
         curves.append(torch.stack(mean))
-    assert float(curves[0][-1].abs()) < 0.5  # it vibrates and decays
+    assert float(curves[0][-1].abs()) < 0.5  # it vibrates with decreasing amplitude
     for curve in curves[1:]:
         torch.testing.assert_close(curve, curves[0], rtol=0, atol=0.05)
 
@@ -201,7 +203,7 @@ def test_motions_round_trip(tmp_path, assets, device):
     made = concatenate_motions(list(simulate({"a": config}, assets, SimulationSettings(COARSE, 4, 60, device))))
     write_motions(tmp_path / "m.h5", made, {"command": "test"})
     back = read_motions(tmp_path / "m.h5")
-    with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters compress as well
+    with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters compress as well as ours
         chunk = file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]
         file["points"][...] = file["points"][...]
         assert len(file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]) == pytest.approx(len(chunk), rel=0.05)
@@ -235,7 +237,7 @@ def test_interrupted_run_resumes_to_the_same_bytes(tmp_path, assets, monkeypatch
 
 def test_particles_are_cached(tmp_path, monkeypatch):
     monkeypatch.setattr(object_particles, "OBJECTS", {"duck": object_particles.OBJECTS["duck"]})
-    monkeypatch.setattr(object_particles, "make_object", full_size)  # made once
+    monkeypatch.setattr(object_particles, "make_object", full_size)  # the object is cached
     discretisation = Discretisation(dx=0.03, spacing=0.03)
     made = object_particles.load_assets(discretisation, 64, tmp_path / "p.npz")
     monkeypatch.setattr(object_particles, "make_object", None)  # must not be called
@@ -264,5 +266,5 @@ def test_perturbed_scenes_start_displaced_by_the_given_distance(extents, monkeyp
     assert moved == perturbed(configs, 1e-3) and set(moved) == set(configs)
     apart = np.array([np.subtract(moved[n].translation, c.translation) for n, c in configs.items()]).reshape(-1, 3)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 1e-3, rtol=1e-9)
-    assert np.linalg.matrix_rank(apart) == 3  # in different directions
-    assert len(np.unique(apart.round(9), axis=0)) == len(apart)  # in every scene
+    assert np.linalg.matrix_rank(apart) == 3  # displacements have different directions
+    assert len(np.unique(apart.round(9), axis=0)) == len(apart)  # and differ between scenes

@@ -1,4 +1,4 @@
-"""Objects other than the ten: held-out shapes, random shapes, solid shapes, rotated objects, meshes."""
+"""Objects other than the ten: held-out shapes, random shapes, solid shapes, rotated objects and meshes."""
 
 import json
 
@@ -39,7 +39,7 @@ def test_surface_points_are_evenly_spaced(name):
     assert len(points) == 2000 and float(sides.max()) == pytest.approx(1.0)
     assert (points.amax(0) + points.amin(0)).abs().max() < 1e-5
     gap = torch.cdist(points, points).fill_diagonal_(9).min(1).values
-    # of random points a tenth would be closer than a fifth of the median distance
+    # for random points, a tenth of the distances would be below a fifth of the median
     assert float((gap < 0.2 * gap.median()).float().mean()) < 0.01 and float(gap.max()) < 4 * float(gap.median())
 
 
@@ -57,7 +57,7 @@ def test_ball_is_round_and_knot_is_connected():
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """Cached particles of all shapes, sampled from few points."""
+    """Cached particles of all shapes, sampled with few points."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(extra_objects, "SURFACE_POINTS", 2000)
         path = tmp_path_factory.mktemp("held") / "p.npz"
@@ -92,7 +92,7 @@ def test_group_is_written_once(assets, tmp_path, monkeypatch):
     kinds = {k.id: k for k in HELDOUT_SHAPES.values()}
     for row, ids in enumerate(made.objects.tolist()):
         assert [float(E) for E in made.E[row]] == [kinds[i].E for i in ids]
-    # unsupported objects fall: 5 m/s^2 for two frames
+    # unsupported objects fall with 5 m/s^2 for two frames
     dropped = (made.points[:, 0, :, :, 2] - made.points[:, 2, :, :, 2]).amax()
     assert float(dropped) == pytest.approx(5 / 2 * 0.04**2, rel=0.15, abs=2e-4)
     assert "exists already" in run(tmp_path, options)
@@ -125,20 +125,20 @@ def test_meshes_replace_the_shapes(tmp_path, caplog):
         expected = [0.3, 0.15, 0.075] if id == 100 else [0.3] * 3
         assert row == pytest.approx(expected, abs=0.03)
     found = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
-    stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, limited to what the solver can simulate
+    stiffness = {100: 1e4, 101: 2e7}  # a pillow, and steel limited to a stiffness that the solver can simulate
     assert found.items() <= stiffness.items()
     config = json.loads((tmp_path / "scene_configs" / f"{HELDOUT}.json").read_text())
     assert len(config) == 1
 
 
 def test_a_folder_of_stiff_meshes_is_simulated_without_loss(tmp_path):
-    """A sheet without thickness and a plank of two files, at a substep that their stiffness forbids."""
+    """A sheet without thickness and a plank in two files, with an option for the substep that is too long for them."""
     pytest.importorskip("trimesh")
     meshes = tmp_path / "meshes"
     (meshes / "wood").mkdir(parents=True)
     (meshes / "paper sheet.obj").write_text("v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nf 1 2 3 4\n")
     for i in range(2):
-        at = 300 * i  # millimetres, say
+        at = 300 * i  # for example in millimetres
         corners = "".join(f"v {x} {y} {at + z}\n" for z in (0, 200) for y in (0, 200) for x in (0, 200))
         sides = "f 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\nf 2 4 8 6\n"
         (meshes / "wood" / f"plank_{i}.obj").write_text(corners + sides)
@@ -148,7 +148,7 @@ def test_a_folder_of_stiff_meshes_is_simulated_without_loss(tmp_path):
     with h5py.File(tmp_path / "out" / "motions" / f"{HELDOUT}.h5") as file:
         made_by = json.loads(file.attrs["provenance"])
     assert [i["name"] for i in made_by["inputs"]][1:] == ["paper sheet.obj", "plank_0.obj", "plank_1.obj"]
-    assert made_by["options"]["substep"] < options.substep  # as simulated
+    assert made_by["options"]["substep"] < options.substep  # the substep of the simulation is stored
     made = read_motions(tmp_path / "out" / "motions" / f"{HELDOUT}.h5")
     sides = (made.points[:, 0].amax(2) - made.points[:, 0].amin(2)).flatten(0, 1)
     for id, row in zip(made.objects.flatten().tolist(), sides.tolist(), strict=True):
@@ -174,7 +174,7 @@ def test_meshes_become_a_training_group_of_random_sizes_and_materials(tmp_path, 
         assert (torch.cdist(a.points, a.points).amax() >= 0.9 * a.scale) and (
             a.points.amax(0) + a.points.amin(0)
         ).norm() < 0.1
-        if i % 2 == 0:  # not rotated
+        if i % 2 == 0:  # every other object is not rotated
             assert float((a.points.amax(0) - a.points.amin(0)).amax()) == pytest.approx(a.scale, rel=0.1)
     assert len({round(a.scale, 6) for a in made.values()}) == 6
     options = HeldoutOptions(scenes=2, objects=2, shapes=4, seed=1, **(COARSE | {"frames": 4}))
@@ -193,7 +193,7 @@ def test_random_shapes_are_reproducible_and_within_the_range_of_the_ten():
         points = surface_points(kind, 800)
         sides = points.amax(0) - points.amin(0)
         assert float(sides.max()) == pytest.approx(1.0) and float(sides.min()) > 0.02, name
-        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # the shape lies inside the sampled cube
+        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # the shape is inside the sampled cube
         assert 0.3 <= kind.scale <= 1 and 100 <= kind.density <= 2700 and 10 <= kind.E / kind.density <= 7400
     assert len({k.id for k in table.values()} | {k.id for k in HELDOUT_SHAPES.values()}) == 18 + 8
 
@@ -209,7 +209,7 @@ def test_random_shapes_become_a_training_group(tmp_path, monkeypatch):
 
 
 def test_solid_shapes_are_filled_and_have_the_mass_of_their_volume(tmp_path, monkeypatch):
-    """The keypoints remain those of the surface."""
+    """The keypoints are still on the surface."""
     monkeypatch.setattr(extra_objects, "SURFACE_POINTS", 2000)
     kind = ShapeKind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
     ball = load_shape_assets({"ball": kind}, Discretisation(0.04, 0.03, 5e-4), 40, solid=True)[7]
@@ -221,7 +221,7 @@ def test_solid_shapes_are_filled_and_have_the_mass_of_their_volume(tmp_path, mon
         for dx in (0.04, 0.06)
     )
     assert torch.equal(fine.points, ball.points)
-    assert len(coarse.points) < len(fine.points)  # the cache is not used for another dx
+    assert len(coarse.points) < len(fine.points)  # the cache is not used for a different dx
     volume = float(4 / 3 * torch.pi * 0.3**3)
     around = float(4 * torch.pi * 0.3**2) * 0.04
     assert volume < ball.mass / 500 < volume + around  # cells at the surface count fully

@@ -1,4 +1,4 @@
-"""Import of published frames: a folder written with h5py and plyfile alone, and one that ngff wrote."""
+"""Import of published frames: a folder written with h5py and plyfile alone, and one written by ngff."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ NAME = "2700_7_11"
 
 
 def turn(t: int) -> np.ndarray:
-    """Rotation of the phone in frame t: 20 degrees a frame about z."""
+    """Rotation of the phone in frame t, by 20 degrees per frame about z."""
     c, s = np.cos(np.radians(20 * t)), np.sin(np.radians(20 * t))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
@@ -35,7 +35,7 @@ def published(tmp_path):
     rng = np.random.default_rng(0)
     start = np.concatenate([rng.uniform(-0.1, 0.1, (DUCK, 3)) + [0, 0, 0.3], rng.uniform(-0.2, 0.2, (PHONE, 3)) - 0.5])
     n, opacity = len(start), np.full(len(start), 2.0)
-    opacity[7] = -6.0  # 0.0025
+    opacity[7] = -6.0  # an opacity of 0.0025
     fields = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(24)),
               "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
     rows = np.zeros(n, [(f, "<f4") for f in fields])
@@ -71,7 +71,7 @@ def published(tmp_path):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Published counts replaced by those of the folder."""
+    """Replace the published numbers by those of the folder."""
     monkeypatch.setitem(importer.PUBLISHED_COUNTS, "duck", DUCK)
     monkeypatch.setitem(importer.PUBLISHED_COUNTS, "phone", PHONE)
 
@@ -84,7 +84,8 @@ def test_imported_motion_matches_the_frames(published, small, tmp_path):
     assert t.info.dt == 0.02 and t.info.gravity == (0, 0, -5) and t.scene.floor == -0.94
     assert len(t.scene.gaussians) == 100 and len(t.scene.cameras) == 100
     fallen = t.com[0, 0, 2] - t.com[:, 0, 2]
-    torch.testing.assert_close(fallen, 2.5 * (0.02 * torch.arange(FRAMES)) ** 2, rtol=0, atol=2e-4)  # float16, averaged
+    # the tolerance is for averages of float16
+    torch.testing.assert_close(fallen, 2.5 * (0.02 * torch.arange(FRAMES)) ** 2, rtol=0, atol=2e-4)
     torch.testing.assert_close(t.com[:, 1], t.com[:1, 1].expand(FRAMES, 3), rtol=0, atol=2e-4)
     expected = torch.tensor(np.stack([turn(i) for i in range(FRAMES)]), dtype=torch.float32)
     torch.testing.assert_close(matrix(t.rotation[:, 1]), expected, rtol=0, atol=2e-3)
@@ -104,7 +105,7 @@ def test_imported_trajectory_can_be_rendered_and_evaluated(published, small, tmp
 
 
 def test_generated_frames_round_trip(tmp_path, monkeypatch):
-    """Skinning to keypoints reproduces the frames of all particles to about float16 precision."""
+    """Skinning to keypoints reproduces the frames of all particles with about the precision of float16."""
     shrink(monkeypatch.setattr, monkeypatch.setitem)
     generate.run(tmp_path, replace(OPTIONS, parts="scenes,mpm", frames=12, limit=1))
     folder = next((tmp_path / "mpm" / "3_9").iterdir())

@@ -1,4 +1,4 @@
-"""Generation on a Ray cluster of two workers on this machine gives the same files as without Ray."""
+"""Generation on a local Ray cluster of two workers gives the same files as without Ray."""
 
 import os
 from dataclasses import replace
@@ -50,5 +50,5 @@ def test_two_workers_write_the_same_files_as_one_process(tmp_path, monkeypatch):
     made = {p.relative_to(tmp_path / "ray") for p in (tmp_path / "ray").rglob("*") if p.is_file()}
     assert made == {p.relative_to(tmp_path / "alone") for p in (tmp_path / "alone").rglob("*") if p.is_file()}
     for name in made:
-        if name.name not in ("3_9.h5", "4.h5") and name.parent.name != "sums":  # these contain the options
+        if name.name not in ("3_9.h5", "4.h5") and name.parent.name != "sums":  # these files contain the options
             assert (tmp_path / "ray" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name

@@ -1,4 +1,4 @@
-"""The files of each scene: published layout, contents, resuming after a kill, verification."""
+"""The files of each scene: published layout, contents, resuming after a kill, and verification."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ def options(device) -> DatasetOptions:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory, options):
-    """All parts of two small scenes."""
+    """A data set with all parts of two small scenes."""
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch.setattr, patch.setitem)
         root = tmp_path_factory.mktemp("data")
@@ -80,19 +80,19 @@ def test_frames_have_the_published_contents(data):
         red = np.stack([vertices[f"f_rest_{i}"] for i in range(8)], 1)[matter]
         np.testing.assert_allclose(sh["shs"][:, 1:, 0], red, atol=2e-4)
         np.testing.assert_allclose(opacity["opacity"][:, 0], 1 / (1 + np.exp(-logits[matter])), atol=1e-3)
-    # the first frame has the positions of the scene, no rotation, and covariance R S S^T R^T
+    # the first frame has the scene's positions, no rotation, and covariances R S S^T R^T
     np.testing.assert_allclose(frames[0]["pos"][:], xyz, atol=1e-3)
     np.testing.assert_allclose(frames[0]["rot"][:], np.eye(3)[None].repeat(len(xyz), 0), atol=1e-3)
     scales = np.exp(np.stack([vertices[f"scale_{i}"] for i in range(3)], 1)[matter])
     cov = frames[0]["cov3D"][:].astype(float)
     np.testing.assert_allclose(cov[:, [0, 3, 5]].sum(1), (scales**2).sum(1), rtol=2e-2)
-    # the objects fall freely under 5 m/s^2 for two frames
+    # the objects fall with 5 m/s^2 for two frames
     fallen = (frames[0]["pos"][:, 2].astype(float) - frames[2]["pos"][:, 2]).max()
     assert fallen == pytest.approx(5 / 2 * 0.04**2, abs=1.5e-3)
 
 
 def test_rotated_gaussians_are_stored_rotated(tmp_path, device):
-    """A quarter turn of one object about z rotates positions, covariances and the (transposed) rotation."""
+    """One object rotates by 90 degrees about z; positions, covariances and the (transposed) rotation follow."""
     g = brick()
     points, centre = g.means[::4].contiguous(), torch.tensor([0.1, 0.2, 0.3])
     index, weight = nearest_weights(points, g.means, 8)
@@ -162,7 +162,7 @@ def test_damaged_files_are_found_and_repaired(data, options):
     with pytest.raises(InputError, match="is missing"):
         generate.check(data)
     generate.run(data, options)
-    assert digests(data) == before  # although only one scene was simulated again
+    assert digests(data) == before  # only one scene was simulated again
 
 
 @pytest.mark.slow
@@ -198,10 +198,10 @@ def test_full_disk_is_reported_before_writing(tmp_path, monkeypatch):
 
 def test_existing_files_are_not_counted(data):
     before = disk_usage.missing_bytes(dataset_layout.Layout(data / "none"), replace(OPTIONS, frames=100, limit=0))
-    assert before["dynamic"] == 2 * 2 * 32**2 * 100 * disk_usage.VIDEO_FIXED_CAMERA  # 2 scenes, 2 views
+    assert before["dynamic"] == 2 * 2 * 32**2 * 100 * disk_usage.VIDEO_FIXED_CAMERA  # 2 scenes with 2 views
     left = disk_usage.missing_bytes(dataset_layout.Layout(data), OPTIONS)
     assert left["mpm"] < 0.15 * 2 * disk_usage.SizeEstimate(3, 64, 32).mpm(1800)
-    assert left["scene_configs"] == 0  # a file that exists is complete
+    assert left["scene_configs"] == 0  # existing files are complete
 
 
 def test_missing_sizes_are_printed(tmp_path, capsys):
@@ -212,7 +212,7 @@ def test_missing_sizes_are_printed(tmp_path, capsys):
 
 
 def test_size_estimates_match_the_files(data):
-    """Only of uncompressed parts; videos of 32 px are mostly headers."""
+    """Only uncompressed parts are tested, because videos of 32 px consist mostly of headers."""
     sizes, folder = disk_usage.SizeEstimate(3, 64, 32), next((data / "mpm" / "3_9").iterdir())
     with h5py.File(folder / "opacity.h5") as file:
         count = len(file["opacity"])

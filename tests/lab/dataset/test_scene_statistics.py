@@ -1,4 +1,4 @@
-"""Statistics and sensitivity of hand-made motions whose values are known."""
+"""Statistics and sensitivity of constructed motions whose values are known."""
 
 import json
 import math
@@ -19,7 +19,7 @@ BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))
 
 
 def shell(radius, low=-1.0, seed=0):
-    """Points on a sphere, above `low` radii."""
+    """Points on a sphere whose height is above `low` radii."""
     rng = torch.Generator().manual_seed(seed)
     p = torch.nn.functional.normalize(torch.randn(20 * N, 3, generator=rng), dim=1)
     return radius * p[p[:, 2] > low][:N]
@@ -35,14 +35,14 @@ def still(points, at):
 
 
 def moving(points, start, end, frames=12):
-    """Moving from `start` to `end` in `frames` frames, then at rest."""
+    """Points that move from `start` to `end` in `frames` frames and are then at rest."""
     u = (torch.arange(T) / frames).clamp_max(1)[:, None]
     path = torch.lerp(torch.tensor(start), torch.tensor(end), u)
     return points[None] + path[:, None]
 
 
 def motions(*objects, ids):
-    """Motions of one scene, from points (t, n, 3) of each object."""
+    """Motions of one scene, given by points (t, n, 3) of each object."""
     points = torch.stack([torch.stack(objects, 1)])
     n = torch.ones(1, len(ids))
     return KeypointMotions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX, n)
@@ -54,7 +54,7 @@ def test_ball_that_falls_into_a_bowl_is_contained():
                 still(duck, [0.8, 0.0, -0.82]), ids=[2, 0, 7])  # fmt: skip
     f = compute_statistics(m)
     assert f.falls.tolist() == [[0, 1, 0]] and f.contained.tolist() == [[0, 1, 0]]
-    assert f.touch.tolist() == [[1, 0, 0]]  # pairs 01 02 12
+    assert f.touch.tolist() == [[1, 0, 0]]  # pairs 0-1, 0-2 and 1-2
     assert f.at_rest.tolist() == [[1, 1, 1]] and f.stacked.tolist() == [[0, 1, 0]]
     assert f.deformation.max() < 1e-5 and f.tipped.tolist() == [[0, 0, 0]]
     assert float(f.spread[0]) == pytest.approx((2 * 0.8 / 3 + 4 * 0.8 / 3 / 2) / 3, rel=0.02)
@@ -82,7 +82,7 @@ def test_deformation_tilt_and_speed_are_measured():
     assert f.touch.shape == (1, 0)
     squashed = still(p, [0.0, 0, 0]).clone()
     squashed[10:, :, 2] *= 0.5
-    # the best rotation is the identity, half of each z is the residual
+    # the best rotation is the identity, so the residual is half of each z
     q = p - p.mean(0)
     expected = ((0.5 * q[:, 2]).square().mean() / q.square().sum(1).mean()).sqrt()
     assert compute_statistics(motions(squashed, ids=[0])).deformation.item() == pytest.approx(float(expected), rel=1e-3)
@@ -111,7 +111,7 @@ def test_command_writes_and_prints_statistics(tmp_path):
 
 
 def test_sensitivity_is_the_error_between_two_runs(tmp_path):
-    """One of two scenes is displaced by 0.1 m from frame 10 on; a third is only in one run."""
+    """One of two scenes is displaced by 0.1 m from frame 10 on; a third one exists in only one run."""
     path = moving(shell(0.1), [0.0, 0, 0.4], [0.0, 0, -0.8])
     aside = path + torch.tensor([1e-3, 0, 0])
     aside = torch.cat([aside[:10], aside[10:] + torch.tensor([0.0, 0.1, 0])])
@@ -121,7 +121,7 @@ def test_sensitivity_is_the_error_between_two_runs(tmp_path):
         write_motions(tmp_path / name / "3_9.h5", concatenate_motions(scenes), {})
     line = sensitivity.run(tmp_path / "a", tmp_path / "b", tmp_path / "p.json", 256, "auto")[2]
     row = json.loads((tmp_path / "p.json").read_text())["splits"]["spatial"]
-    # scene 0: 10 frames of 1 mm, 10 of 1 mm and 0.1 m; scene 1: 1 mm; an RMSE is over three axes
+    # scene 0 has 10 frames with 1 mm and 10 with 1 mm and 0.1 m, scene 1 has 1 mm; an RMSE is over three axes
     first, second = math.sqrt((1e-6 + 0.5 * 0.01) / 3), math.sqrt(1e-6 / 3)
     assert row["RMSE"] == pytest.approx((first + second) / 2, rel=1e-2) and row["scenes"] == 2
     assert row["FPE"] == pytest.approx((math.hypot(0.1, 1e-3) + 1e-3) / 2, rel=1e-2)

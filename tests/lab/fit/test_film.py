@@ -1,4 +1,4 @@
-"""Materials from films of a toy that our own `render` wrote; films that cannot be compared are refused."""
+"""Materials from films of a toy rendered by `render`; unsuitable films are refused."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ FRAMES = 8
 
 
 def still_film(path, frames=4, fps=50.0, size=(64, 48)):
-    """A grey film."""
+    """A film of constant grey."""
     with VideoWriter(path, fps) as video:
         for _ in range(frames):
             video.append(torch.full((size[1], size[0], 3), 0.5))
@@ -32,19 +32,19 @@ def still_film(path, frames=4, fps=50.0, size=(64, 48)):
 
 
 def true_point(problem, toy):
-    """Its coordinates, with the initial value of the loss factor, which a slide does not show."""
+    """Its true coordinates, with the initial value of the loss factor, which a slide does not reveal."""
     true = {"friction": toy.material.friction, "x": toy.velocity[0], "y": toy.velocity[1]}
     return np.array([p.coordinate(true.get(p.name, p.start)) for p in problem.parameters])
 
 
 def values(problem, x):
-    """Of the parameters, by name."""
+    """Values of the parameters by name."""
     return {p.name: p.value(v) for p, v in zip(problem.parameters, x, strict=True)}
 
 
 @pytest.fixture(scope="module")
 def slide(tmp_path_factory, device):
-    """A block that slides, its scene and films, and the problem of these."""
+    """A sliding block, its scene and films, and the fit problem of these."""
     folder, toy = tmp_path_factory.mktemp("slide"), filmed_toy("slide", 2, 160, seed=110)
     scene, films = film(toy, FRAMES, folder)
     return toy, scene, films, read_film_problem(scene, films, replace(OPTIONS, device=device))
@@ -59,7 +59,7 @@ def test_the_true_motion_explains_the_pictures_best(slide):
         return problem.cost(problem.residuals(problem.motion(exact + change)))
 
     least = cost(np.zeros(4))
-    assert least < problem.noise_margin * problem.noise_level**2  # as the poses that are free of any engine
+    assert least < problem.noise_margin * problem.noise_level**2  # as for tracked poses without any engine
     assert all(
         cost(sign * change) > 1.1 * least for change in np.diag([0.1, 0, 0.02, 0.02])[[0, 2, 3]] for sign in (1, -1)
     )
@@ -68,7 +68,7 @@ def test_the_true_motion_explains_the_pictures_best(slide):
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [0, 1], ids=["coarse", "fine"])
 def test_friction_and_velocity_are_found_from_near_in_pictures_alone(level, slide):
-    """And the motion within a millimetre at every keypoint and time, from ten: these trade against each other."""
+    """The motion improves from 5 mm or more to within 1 mm at all points and times; the parameters are correlated."""
     toy, _, _, problem = slide
     exact = true_point(problem, toy)
     near = Estimate(exact + [0.03, 0.0, 0.02, -0.02], np.diag([0.03, 0.05, 0.02, 0.02]))
@@ -105,12 +105,12 @@ def test_large_differences_are_bounded():
 
 
 def test_without_time_pictures_determine_no_intervals(slide):
-    """Those of the track before are not given for them."""
+    """The intervals of the preceding track are not reported instead."""
     *_, problem = slide
     fit = solve(problem, replace(OPTIONS, minutes=1e-6))
     assert fit.problem is problem and not fit.determined
     assert [fit.half_width(k) for k in range(4)] == [None] * 4
-    assert fit.evaluations == 2 * OUTCOME  # of the track and of the pictures
+    assert fit.evaluations == 2 * OUTCOME  # one run each for the track and the images
 
 
 def test_time_is_kept_for_pictures_but_not_more_than_half(slide):

@@ -1,4 +1,4 @@
-"""Materials from motion: true values come back from tracks of known motion, and what a motion does not show is said."""
+"""Materials from motion: true values are found from tracks of known motion, and undetermined ones are reported."""
 
 import json
 from dataclasses import replace
@@ -44,13 +44,13 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner, ring
 
-NOISE = 0.002  # of the tracks [m]
+NOISE = 0.002  # standard deviation of positions in the tracks [m]
 TRUTH = {"E": 1e7, "density": 540.0, "friction": 0.3, "loss": 0.35}
 OPTIONS = MaterialFitOptions(workers=1, keypoints=16, evaluations=400)
 
 
 def make_track(folder, thing, noise=NOISE, **options):
-    """A scene of one object and a noisy track of its motion, as files."""
+    """Files with a scene of one object and a noisy track of its motion."""
     write_scene(folder / "scene.ply", Run((thing,)).scene())
     (folder / "truth.json").write_text(json.dumps({"1": TRUTH}))
     simulate(folder / "scene.ply", folder / "exact.h5", SimulateOptions(
@@ -72,14 +72,14 @@ def slide(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bounce(tmp_path_factory):
-    """A ball falls without turning and rebounds once."""
+    """A ball falls without rotation and rebounds once."""
     folder = tmp_path_factory.mktemp("bounce")
     return make_track(folder, ball(0.1, (0.0, 0.0, 0.1)), lift=("0.2",), steps=25)
 
 
 @pytest.fixture(scope="module")
 def bounce_fit(bounce, device):
-    """The fit of the bounce, made by the command; what that prints, and its file of materials."""
+    """The fit of the bounce by the command, the command's output, and its file of materials."""
     fits, out = [], bounce / "m.json"
     words = ["fit", bounce / "scene.ply", bounce / "track.h5", "-o", out, "--workers", 1, "--keypoints", 16,
              "--evaluations", OPTIONS.evaluations, "--device", device]  # fmt: skip
@@ -107,7 +107,7 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
     assert not fit.is_identifiable(of(fit, "loss"))
     assert fit.rmse[1] == pytest.approx(3**0.5 * NOISE, rel=0.1) and fit.rmse[0] > 0.02
     materials, velocity = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
-    assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
+    assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # the initial value of the search
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_two_processes_simulate_the_same_as_one(slide, device):
 
 
 def test_friction_is_found_from_near_and_its_uncertainty_is_small(slide, device):
-    """By Levenberg and Marquardt's method alone; the slide shows nothing of the rebound."""
+    """Only Levenberg and Marquardt's method is used; the slide does not depend on the rebound."""
     problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, frames=14))
     true = {"friction": 0.3, "loss": problem.materials[1].loss, "x": 2.0, "y": 0.5}
     exact = np.array([p.coordinate(true[p.name]) for p in problem.parameters])
@@ -140,7 +140,7 @@ def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce_fit):
     k = of(fit, "loss")
     assert fit.is_identifiable(k) and abs(fit.value(k) - 0.35) < 2 * fit.half_width(k) < 0.05
     assert not fit.is_identifiable(of(fit, "friction"))
-    assert len(fit.problem.parameters) == 2  # neither a velocity, as it is released from rest, nor a density
+    assert len(fit.problem.parameters) == 2  # no velocity, because it is released from rest, and no density
 
 
 def test_the_command_writes_materials_that_simulate_takes(bounce, bounce_fit):
@@ -161,7 +161,7 @@ def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
 
 
 def test_the_command_that_repeats_the_motion_has_its_conditions(slide):
-    """Objects that are not held at rest, and a gravity that is not that of `ngff simulate`: of a track on the moon."""
+    """Objects not held at rest, and a gravity other than that of `ngff simulate`, for a track on the moon."""
     scene, truth = read_scene(slide / "scene.ply"), read_trajectory(slide / "track.h5")
     moon = replace(truth, info=replace(truth.info, gravity=(0.0, 0.0, -1.62)))
     problem = pose_problem(scene, moon, ForcePrompts(), replace(OPTIONS, rest=False))
@@ -177,14 +177,15 @@ def test_the_command_that_repeats_the_motion_has_its_conditions(slide):
 
 
 @pytest.mark.parametrize(("heights", "stands", "found"), [
-    ([0.0, -0.001, -0.003, -0.002, -0.001], False, {}),  # settles on what it stands on
+    ([0.0, -0.001, -0.003, -0.002, -0.001], False, {}),  # settles on its support
     ([0.0, -0.00196, -0.00785, -0.01766, -0.03139], False, {}),  # is released from rest
-    ([0.0, 0.01804, 0.03215, 0.04234, 0.04861], True, {"x": 0.0, "y": 0.0, "z": 1.0}),  # is thrown upwards at 1 m/s
+    ([0.0, 0.01804, 0.03215, 0.04234, 0.04861], True, {"x": 0.0, "y": 0.0, "z": 1.0}),  # is thrown upwards with 1 m/s
     ([0.0, -0.0036, -0.0072, -0.0108, -0.0144], False, {"x": 0.0, "y": 0.0, "z": 0.1463}),
-    ([0.0, -0.0036, -0.0072, -0.0108, -0.0144], True, {}),  # it cannot: an error of the track's depth
+    # a standing object cannot fall, so this is an error of the track's depth
+    ([0.0, -0.0036, -0.0072, -0.0108, -0.0144], True, {}),
 ])  # fmt: skip
 def test_what_settles_or_stands_does_not_fly(heights, stands, found, slide):
-    """Of two explanations of the heights in the first five frames the nearer one that is possible counts."""
+    """Of two explanations of the heights in the first five frames, the closer possible one is chosen."""
     problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
     centre = torch.tensor([[0.0, 0.0, z] for z in heights])
     velocity = _first_velocity(problem, centre, 0.0025, stands)
@@ -199,7 +200,7 @@ def test_what_stands_gets_no_vertical_velocity_from_errors_of_the_depth(slide):
 
 
 def test_the_learned_engine_is_fitted_with_contacts_that_know_stiffness(slide):
-    """Also of an object that `ngff simulate` would take to be stiff, with solved contacts."""
+    """The object is stiff, so that `ngff simulate` would use solved contacts by default."""
     problem = read_problem(slide / "scene.ply", slide / "track.h5", replace(OPTIONS, engine="ngff"))
     assert [p.name for p in problem.parameters] == ["friction", "loss", "E", "x", "y"]
     fit = Fit(problem, Estimate(np.zeros(5), np.eye(5)), np.zeros(5), (0.0, 0.0), 0, 0.0)
@@ -234,7 +235,7 @@ def test_tracks_that_do_not_fit_the_scene_are_refused(slide):
 
 
 def test_a_track_in_another_frame_is_aligned(slide):
-    """By cameras with the same names; scales, directions, ids and names of objects differ."""
+    """Cameras with the same names define the alignment; scales, directions, ids and names of objects differ."""
     scene, truth = read_scene(slide / "scene.ply"), read_trajectory(slide / "track.h5")
     turned = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     cameras, away = ring(count=3), Similarity(2.0, turned, torch.ones(3))
@@ -253,7 +254,7 @@ def test_a_track_in_another_frame_is_aligned(slide):
 
 
 def test_a_track_with_prompts_of_another_frame_is_refused(bounce):
-    """But for start velocities, which are fitted."""
+    """The exception are start velocities, because these are fitted."""
     scene, track = replace(read_scene(bounce / "scene.ply"), cameras=ring()), read_trajectory(bounce / "track.h5")
     with pytest.raises(InputError, match="without --align"):
         aligned(track, scene, bounce / "scene.ply")
@@ -272,7 +273,7 @@ def test_parameters_become_materials_and_velocities():
     assert pytest.approx(1e6) == materials[1].E and materials[1].density == pytest.approx(500)
     assert velocity == {1: (pytest.approx(1.0), pytest.approx(0.0), 0.0)}
     materials, velocity = fitted(parameters, [1.0, 1.0, 0.0, 1.0, 0.0], {1: m})
-    assert materials[1].friction == 1.2 and materials[1].density == pytest.approx(5000)  # ten times
+    assert materials[1].friction == 1.2 and materials[1].density == pytest.approx(5000)  # ten times the initial density
     assert pytest.approx(1e3) == materials[1].E and velocity == {1: (2.0, -1.0, 0.0)}
 
 
@@ -281,7 +282,7 @@ def test_noise_is_estimated_beside_motion_and_collisions():
     path = torch.where(t < 0.5, 2 * t, 2 - 2 * t) * torch.tensor([1.0, 0, 0]) - 4.9 * t**2 * torch.tensor([0, 0, 1.0])
     rng = torch.Generator().manual_seed(0)
     track = path + 0.003 * torch.randn(50, 20, 3, generator=rng)
-    # 3,000 correlated third differences: a few per cent
+    # 3,000 correlated third differences have an error of a few percent
     assert estimate_noise(track) == pytest.approx(0.003, rel=0.06)
 
 
@@ -289,25 +290,25 @@ def test_parameters_that_act_together_keep_their_sum():
     sum_known, difference = np.array([[1.0], [1.0]]) / 2**0.5, np.array([[1.0], [-1.0]]) / 2**0.5
     found = Estimate(np.array([0.3, 0.4]), np.hstack([0.01 * sum_known, 0.3 * difference]))
     accepted = with_initial(found, np.array([0.15, 0.15]), [0, 1])
-    assert accepted == pytest.approx([0.15, 0.55], abs=0.002)  # both at 0.15 would be wrong
+    assert accepted == pytest.approx([0.15, 0.55], abs=0.002)  # 0.15 for both would be wrong
     alone = Estimate(found.x, np.diag([0.2, 0.01]))
     assert with_initial(alone, np.array([0.15, 0.15]), [0]) == pytest.approx([0.15, 0.4])
 
 
 @pytest.mark.parametrize("residual", [
-    lambda d: d + 2 * d**2,  # curved: central, without the bias of one side
-    lambda d: d + 100 * max(d, 0.0),  # another motion above: the slope of the other side
-    lambda d: d - 100 * max(-d, 0.0),  # and below
+    lambda d: d + 2 * d**2,  # with curvature, the central difference avoids the bias of one-sided ones
+    lambda d: d + 100 * max(d, 0.0),  # with a different motion above, the slope below is used
+    lambda d: d - 100 * max(-d, 0.0),  # and vice versa
 ])  # fmt: skip
 def test_derivatives_are_central_but_for_a_side_with_another_motion(residual):
     step = 0.1
     sims = SimpleNamespace(residuals=lambda points, frames: [np.array([residual(float(x[0]) - 0.5)]) for x in points])
     found = float(_derivatives(sims, 1, Estimate(np.array([0.5]), np.array([[step]])))[0, 0])
-    assert found == pytest.approx(step, rel=1e-6)  # per unit of the root
+    assert found == pytest.approx(step, rel=1e-6)  # derivative per unit of the root
 
 
 class Ramp:
-    """A track (k frames) of a height that no motion reaches, where a ramp has two parameters; stands for a Problem."""
+    """Replaces a Problem: a ramp with two parameters, and a track (k frames) of heights it cannot match exactly."""
 
     noise_level, noise_cost = 1e-3, 1e-6
     parameters = [SimpleNamespace(name=name, low=0.0, high=1.0, start=0.2, step=0.2, coordinate=lambda value: value)
@@ -334,7 +335,7 @@ class Ramp:
 
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
 def test_a_track_that_the_engine_cannot_follow_to_its_noise_is_followed_to_its_end():
-    """The search does not use up its simulations on the first segments."""
+    """The search must not spend all its simulations on the first segments."""
 
     class Ramps(Simulations):
         def residuals(self, points, frames):
@@ -345,15 +346,15 @@ def test_a_track_that_the_engine_cannot_follow_to_its_noise_is_followed_to_its_e
     found = search.search(sims, replace(OPTIONS, evaluations=10_000))
     assert sims.count < 2_000
     np.testing.assert_allclose(found.x, [0.6, 0.4], atol=0.02)
-    assert (found.deviations > 0.002).all()  # by more than the noise, and less than before
+    assert (found.deviations > 0.002).all()  # larger than for the noise, and smaller than before
     assert (found.deviations < 0.15).all()
 
 
 @pytest.fixture
 def ramps(monkeypatch):
-    """A function of an end that makes simulations of a ramp, of a second for all frames, until it; and their clock.
+    """Function that creates simulations of a ramp, which end at a given time, and their simulated clock.
 
-    The first one takes two seconds more, as processes start.
+    A simulation of all frames takes one second, and the first one two seconds more, like the start of processes.
     """
     clock = SimpleNamespace(now=0.0, started=False)
     monkeypatch.setattr(search, "time", SimpleNamespace(perf_counter=lambda: clock.now))
@@ -383,7 +384,7 @@ def test_the_simulations_of_the_end_of_a_fit_are_known_beforehand(ramps):
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
 @pytest.mark.parametrize(("until", "determined"), [(0, False), (10, False), (40, False), (140, True), (400, True)])
 def test_a_fit_and_its_intervals_end_in_time(until, determined, ramps):
-    """Or the intervals are not determined: none is of half of the differences."""
+    """If not, the intervals are undetermined, and none is computed from half of the differences."""
     make, clock = ramps
     sims = make(until)
     fit = _settled(sims, search.search(sims, replace(OPTIONS, evaluations=10_000)))
@@ -397,7 +398,7 @@ def test_a_fit_and_its_intervals_end_in_time(until, determined, ramps):
 
 
 def test_what_was_found_before_the_time_ended_stays(ramps):
-    """A descent that ends early is no worse than its start."""
+    """A descent that ends early has a result that is better than its start."""
     make, clock = ramps
     start = Estimate(np.array([0.9, 0.9]), 0.2 * np.eye(2))
     sims = make(20)

@@ -1,4 +1,4 @@
-"""Krippendorff's alpha against the worked examples of its author and of Wikipedia."""
+"""Krippendorff's alpha, compared with the worked examples of its author and of Wikipedia."""
 
 import numpy as np
 import pytest
@@ -45,5 +45,5 @@ def test_agreement_disagreement_and_nothing_to_compare(ordinal):
 
 def test_random_ratings_agree_by_chance():
     ratings = np.random.default_rng(0).integers(1, 6, (20, 400))
-    # 400 units of 20 ratings: the standard error is near sqrt(2 / (400 * 20 * 19)) = .004
+    # the standard error for 400 units of 20 ratings is about sqrt(2 / (400 * 20 * 19)) = 0.004
     assert abs(krippendorff_alpha(coincidences(ratings, 5).sum(0), True)) < 0.015

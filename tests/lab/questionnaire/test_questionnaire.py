@@ -1,4 +1,4 @@
-"""A study from films to table: what participants see and do in a browser, and what the table says of it."""
+"""A study from films to table: actions of participants in a browser, and the resulting table."""
 
 import json
 import random
@@ -19,7 +19,8 @@ from stages.lab.questionnaire.study import run
 from tests.browser import until
 from tests.conftest import CliRunner
 
-OPINIONS = {"ours": (5, 4), "theirs": (2, 4)}  # physical and photo realism of each model, as all participants think
+# physical and photo realism of each model, in the opinion of all participants
+OPINIONS = {"ours": (5, 4), "theirs": (2, 4)}
 
 
 def write_film(path, brightness):
@@ -31,7 +32,7 @@ def write_film(path, brightness):
 
 @pytest.fixture(scope="module")
 def films(tmp_path_factory):
-    """Two models, two splits, two films each; of one model a fifth film."""
+    """Films of two models and two splits, two each, and a fifth film of one model."""
     folder = tmp_path_factory.mktemp("films")
     for model in OPINIONS:
         for split in ("new view", "new background"):
@@ -49,7 +50,7 @@ def study(films, tmp_path_factory):
 
 
 def answer(study, participant, opinion):
-    """Answers of a participant as the page saves them; `opinion` of a model is two answers, or None for no answer."""
+    """Answers of a participant as saved by the page; `opinion` of a model is two answers, or None for no answer."""
     key = json.loads((study / "key.json").read_text())
     rows = []
     for film in key["participants"][participant]:
@@ -72,10 +73,10 @@ def test_films_are_balanced_over_groups_and_over_films():
         per_cell = Counter(cells[i] for i in order)
         assert per_cell["d"] == 1 and all(per_cell[c] == 3 for c in "abc")
     shown = Counter(i for order in orders for i in order)
-    assert [shown[i] for i in range(30)] == [9] * 30  # 30 participants x 3 films of 10 in a group
+    assert [shown[i] for i in range(30)] == [9] * 30  # 30 participants, 3 of 10 films per group
     assert orders == assign_films(cells, 30, 10, 0) != assign_films(cells, 30, 10, 1)
     places = [order.index(30) for order in orders]
-    assert len(set(places)) > 5  # the only film of d is not always at the same place
+    assert len(set(places)) > 5  # the only film of group d is not always at the same position
 
 
 def test_all_films_are_shown_where_there_are_few():
@@ -106,7 +107,7 @@ def test_folders_without_films_are_refused(tmp_path, arrange):
 
 
 def judge_in_browser(page, participant, study):
-    """Judge all films as a participant of known opinion would, with keys for odd films and the mouse for even ones."""
+    """Judge all films as a participant of known opinion, using keys for odd films and the mouse for even ones."""
     key = json.loads((study / "key.json").read_text())
     page.click("#start")
     for k, film in enumerate(key["participants"][participant]):
@@ -145,7 +146,7 @@ def test_participants_of_known_opinion_in_a_browser(study, open_page, tmp_path):
         path = download(page, tmp_path)
         assert path.name == f"answers-{participant}.json"
         saved = json.loads(path.read_text())
-        assert all(row.pop("seconds") >= 0.1 for row in saved["answers"])  # a film lasts .16 s
+        assert all(row.pop("seconds") >= 0.1 for row in saved["answers"])  # a film lasts 0.16 s
         expected = answer(study, participant, OPINIONS.get)
         assert saved == {**expected, "answers": [{k: v for k, v in row.items() if k != "seconds"}
                                                  for row in expected["answers"]]}  # fmt: skip
@@ -158,7 +159,7 @@ def test_participants_of_known_opinion_in_a_browser(study, open_page, tmp_path):
 
 
 def test_a_page_goes_on_where_it_was_left_and_takes_answers_back(films, open_page, tmp_path):
-    study = tmp_path / "study"  # its own: the browser keeps the answers to a study from test to test
+    study = tmp_path / "study"  # a separate study, because the browser keeps the answers to a study between tests
     run(films, study, StudyOptions(participants=1, films=4, seed=7))
     key = json.loads((study / "key.json").read_text())
     page = open_study(open_page, study, "1")
@@ -197,7 +198,7 @@ def test_a_film_that_cannot_be_played_is_passed_over(films, open_page, tmp_path)
 
 
 def test_intervals_and_agreement_of_noisy_participants(films, tmp_path):
-    """40 participants whose answers scatter by one point: means are near their opinion and the interval covers it."""
+    """Answers of 40 participants scatter by one point; means are near their opinion, and intervals contain it."""
     run(films, tmp_path / "study", StudyOptions(participants=40, films=9))
     rng = random.Random(0)
     (tmp_path / "answers").mkdir()
@@ -208,18 +209,18 @@ def test_intervals_and_agreement_of_noisy_participants(films, tmp_path):
     for model, expected in (("ours", 0.75), ("theirs", 0.5)):
         row = table["groups"][model]["PhysR"]
         assert row["low"] < expected < row["high"]
-        # independent answers with a standard deviation of sqrt(2/3) points; drawing both participants and films then
-        # gives up to three times their variance (Owen 2007, section 4)
+        # Answers are independent, with a standard deviation of sqrt(2/3) points; sampling of both participants and
+        # films results in up to three times their variance (Owen 2007, section 4).
         width = 2 * 1.96 * (2 / 3) ** 0.5 / 4 / sum(row["counts"]) ** 0.5
         assert 0.9 * width < row["high"] - row["low"] < 1.1 * 3**0.5 * width
     phys, photo = table["alpha"]["PhysR"]["interval"], table["alpha"]["PhotoR"]["interval"]
-    # variance .25 between films of one point apart (5 and 4 of 9), 2/3 within: alpha near .247 / (.247 + .667)
+    # the variance is 0.25 between films (5 and 4 of 9, one point apart) and 2/3 within: alpha = .247 / (.247 + .667)
     assert phys["alpha"] == pytest.approx(0.27, abs=0.08) and phys["low"] < 0.27 < phys["high"]
     assert abs(photo["alpha"]) < 0.05
 
 
 def test_the_interval_of_the_mean_covers_participants_as_well_as_films(films, tmp_path):
-    """Half of the participants like everything, half nothing: with one more of them the mean is another one."""
+    """Half of the participants like everything, half nothing, so the mean depends on who participates."""
     run(films, tmp_path / "study", StudyOptions(participants=10, films=9))
     (tmp_path / "answers").mkdir()
     likes = {f"{p:02d}": 5 if p % 2 else 1 for p in range(1, 11)}
@@ -228,7 +229,7 @@ def test_the_interval_of_the_mean_covers_participants_as_well_as_films(films, tm
         (tmp_path / "answers" / f"{participant}.json").write_text(json.dumps(row))
     tabulate(tmp_path / "study", [tmp_path / "answers"], tmp_path / "table.json")
     row = json.loads((tmp_path / "table.json").read_text())["groups"]["all"]["PhysR"]
-    # 10 independent opinions of 0 or 1: standard error .5 / sqrt(10) = .158
+    # 10 independent opinions of 0 or 1 have a standard error of 0.5 / sqrt(10) = 0.158
     assert row["mean"] == 0.5
     np.testing.assert_allclose([row["low"], row["high"]], [0.5 - 1.96 * 0.158, 0.5 + 1.96 * 0.158], atol=0.1)
 

@@ -1,4 +1,4 @@
-"""Colours of sides that the first frame does not show are learned from later frames."""
+"""Colours of sides that are not visible in the first frame are learned from later frames."""
 
 import math
 from dataclasses import replace
@@ -25,7 +25,7 @@ GREY = (0.5, 0.5, 0.5)
 
 
 def painted_ball() -> Gaussians:
-    """The ball of the toys, with sectors of six colours, about the origin."""
+    """The ball of the toys with its sectors of six colours, centred at the origin."""
     g = falling_toys().gaussians
     g = thinned(g[g.object_id == 1])
     means = g.means - (g.means.amin(0) + g.means.amax(0)) / 2
@@ -34,7 +34,7 @@ def painted_ball() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def turning():
-    """A ball that turns by 180 degrees before three cameras on one side of it: it, its films, cameras and rotations."""
+    """A ball that rotates by 180 degrees, its films by three cameras on one side, the cameras and the rotations."""
     g, rng = painted_ball(), torch.Generator().manual_seed(0)
     azimuth = torch.linspace(-0.5, 0.5, 3)
     eyes = torch.stack([0.5 * azimuth.cos(), 0.5 * azimuth.sin(), torch.linspace(0.1, 0.3, 3)], 1)
@@ -55,12 +55,12 @@ def turning():
 
 
 def far_side(g: Gaussians, cameras: Cameras) -> torch.Tensor:
-    """Rows of the Gaussians that no camera sees in the first frame: they face away from all."""
+    """Rows of the Gaussians that no camera sees in the first frame, because they face away from all."""
     return (g.means @ centres(cameras.viewmats).T < 0).all(1).nonzero()[:, 0]
 
 
 def half_known(turning, device) -> Tracker:
-    """A tracker of the ball with a far side without colours: grey as the mean of all."""
+    """A tracker of the ball in which the far side has the mean colour of all Gaussians."""
     g, films, cameras, _ = turning
     sh = g.sh.clone()
     sh[far_side(g, cameras)] = sh.mean(0)
@@ -69,13 +69,13 @@ def half_known(turning, device) -> Tracker:
 
 
 def true_poses(tracker: Tracker, turns: torch.Tensor, frame: int) -> Poses:
-    """The poses in a frame."""
+    """The true poses in a frame."""
     turn = turns[frame].to(tracker.device)
     return Poses(turn[None], (turn @ tracker.rest.centre[0])[None])
 
 
 def colour_error(tracker: Tracker, g: Gaussians, cameras: Cameras) -> float:
-    """Mean difference of the far side's colours from the true ones [SH coefficient]."""
+    """Mean difference of the far side's colours from the true ones, as an SH coefficient."""
     off = tracker.synthesiser.rest_gaussians.sh.cpu() - g.sh
     return float(off[far_side(g, cameras)].abs().mean())
 
@@ -89,7 +89,7 @@ def test_the_far_side_of_a_ball_is_not_known(turning, device):
 
 def test_a_ball_is_followed_by_colours_that_it_shows_later(turning, device, monkeypatch):
     g, _, cameras, turns = turning
-    monkeypatch.setattr(follow, "search", lambda *_: None)  # what is lost stays so
+    monkeypatch.setattr(follow, "search", lambda *_: None)  # lost objects are not searched for
     lost, worst = [], []
     for learning in (True, False):
         tracker = half_known(turning, device)
@@ -112,7 +112,8 @@ def test_nothing_is_learned_of_lost_objects_and_from_pictures_that_disagree(turn
     for frame in range(half - 3, half + 1):
         tracker.learn(frame, true_poses(tracker, turns, frame), (still, still), no)
     assert colour_error(tracker, g, cameras) == before
-    tracker.films = [replace(film, frames=film.frames * 0 + 20) for film in films]  # something dark is in front
+    # something dark is in front of the ball
+    tracker.films = [replace(film, frames=film.frames * 0 + 20) for film in films]
     for frame in range(half - 3, half + 1):
         tracker.learn(frame, true_poses(tracker, turns, frame), (still, still), yes)
     assert colour_error(tracker, g, cameras) == before
@@ -123,7 +124,7 @@ def test_nothing_is_learned_of_lost_objects_and_from_pictures_that_disagree(turn
 
 
 def test_one_frame_with_something_else_in_it_does_not_matter(turning, device, monkeypatch):
-    """By the median over frames; here pictures need not agree with what is known."""
+    """The reason is the median over frames; here, images need not agree with known colours."""
     g, _, cameras, turns = turning
     errors, yes = [], torch.tensor([True], device=device)
     for odd in (None, 2):

@@ -1,4 +1,4 @@
-"""Deformations of soft objects: rigidity, and a sheet that bends before four cameras."""
+"""Deformations of soft objects: rigidity, and a bending sheet filmed by four cameras."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from stages.lab.track.follow import TrackedMotion, Tracker
 from stages.lab.track.poses import Poses, rotation_of
 
 WIDTH, HEIGHT, FRAMES = 160, 120, 4
-BEND = 1.2  # curvature that the cushion gains in a frame [1/m]
+BEND = 1.2  # increase of the cushion's curvature per frame [1/m]
 
 
 def cushion() -> Gaussians:
@@ -28,14 +28,14 @@ def cushion() -> Gaussians:
 
 
 def bent(points: torch.Tensor, frame: int) -> torch.Tensor:
-    """Points of the cushion when its ends are bent upwards."""
+    """Points of the cushion after bending its ends upwards."""
     lift = BEND * frame * points[:, 0] ** 2 / 2
     return points + torch.stack([0 * lift, 0 * lift, lift], 1)
 
 
 @pytest.fixture(scope="module")
 def filmed():
-    """A scene with the cushion, and films of four cameras in which it bends."""
+    """A scene with the cushion, its cameras, and films by four cameras in which it bends."""
     g = cushion()
     eyes = torch.tensor([[0.5, 0.1, 0.35], [-0.1, 0.5, 0.3], [-0.5, -0.1, 0.35], [0.1, -0.5, 0.3]])
     viewmats = look_at(eyes, torch.zeros_like(eyes))
@@ -79,7 +79,7 @@ def test_rigidity_does_not_resist_a_rigid_motion(filmed, device):
     stretched = _rigidity(body, 0.1 * body.nodes)[1]
     assert b.abs().max() < 1e-3 * stretched.abs().max()
     shift = torch.ones_like(u).flatten()
-    assert (H @ shift).abs().max() < 1e-3 * H.abs().max()  # nor a displacement of all nodes
+    assert (H @ shift).abs().max() < 1e-3 * H.abs().max()  # displacements of all nodes do not change the energy either
 
 
 def test_soft_objects_are_named(filmed):

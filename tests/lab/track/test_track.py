@@ -1,4 +1,4 @@
-"""Tracking of rendered films of known motion: poses, times of the films, lost objects, files."""
+"""Tracking of rendered films with known motion: poses, times of the films, lost objects and files."""
 
 import json
 from dataclasses import replace
@@ -39,12 +39,12 @@ from stages.lab.track.track import report, run
 from tests.conftest import CliRunner, two_balls_scene
 
 SMALL = StandInOptions(objects=2, cameras=4, width=160, frames=5, hidden=0, seed=8)
-LATE = (0.2, -0.2, 0.1, -0.1)  # of the films' times in the scene file [frames]
+LATE = (0.2, -0.2, 0.1, -0.1)  # errors of the films' times in the scene file [frames]
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A folder with films of which one breaks off, the scene with wrong times, and the true motion."""
+    """A folder with films, one of which is truncated, a scene file with wrong times, and the true motion."""
     folder = tmp_path_factory.mktemp("stand-in")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stand_in_films, "BEFORE", (2, 4))
@@ -132,7 +132,7 @@ def test_alignment_returns_to_the_true_pose(small, device):
 
 
 def labels_at_the_start(stand_in: StandIn, camera: int) -> torch.Tensor:
-    """The label image (h, w) of a film's first frame: ids of the objects, 0 elsewhere."""
+    """The label image (h, w) of a film's first frame: ids of the objects, 0 for the background."""
     scene, synthesiser = stand_in.scene, Synthesiser(stand_in.scene, "cpu")
     size = scene.cameras.sizes[camera].tolist()
     view = synthesiser.camera(scene.cameras.viewmats[camera], scene.cameras.Ks[camera], *size)
@@ -142,7 +142,7 @@ def labels_at_the_start(stand_in: StandIn, camera: int) -> torch.Tensor:
 
 
 def test_label_images_alone_give_the_place(small, device):
-    """Grey objects on grey are where their label images are, in three of four films; the last has none."""
+    """Grey objects on grey are located by their label images in three of four films; the last film has none."""
     _, stand_in = small
     g = stand_in.scene.gaussians
     scene = replace(stand_in.scene, gaussians=replace(g, sh=torch.zeros_like(g.sh)))
@@ -153,7 +153,7 @@ def test_label_images_alone_give_the_place(small, device):
     tracker = Tracker(scene, cameras, films, device)
     off = torch.tensor([0.0, 0.0, 0.0, 0.01, -0.01, 0.01], device=device).expand_as(tracker.still)
     found = tracker.fit(0, {8: 6, 4: 6, 2: 4}, tracker.rest.moved(off), (tracker.still, tracker.still))
-    pixel = 1.1 / (1.25 * SMALL.width)  # at the distance of the objects
+    pixel = 1.1 / (1.25 * SMALL.width)  # size of a pixel at the distance of the objects [m]
     assert (found.centre - tracker.rest.centre).norm(dim=1).max() < pixel / 2
     (there, _), (away, _) = (tracker.judge(0, p, (tracker.still,) * 2) for p in (found, tracker.rest.moved(off)))
     assert there.min() > 0.95 and (away < there - 0.02).all()
@@ -226,7 +226,7 @@ def test_half_turns_are_about_the_principal_axes():
 
 
 def motion(height: list[float], confidence: list[float]) -> TrackedMotion:
-    """One object on these heights."""
+    """The motion of one object with these heights."""
     centre = torch.zeros(len(height), 1, 3)
     centre[:, 0, 2] = torch.tensor(height)
     share = torch.tensor(confidence)[:, None]
@@ -237,7 +237,7 @@ def test_the_release_is_where_a_fall_begins():
     fall = [max(t - 0.4, 0.0) ** 2 * 0.002 for t in range(12)]
     assert release_time(motion([1 - x for x in fall], [1.0] * 12)) == pytest.approx(0.4, abs=0.02)
     assert release_time(motion([1 - 0.001 * t for t in range(12)], [1.0] * 12)) == 0  # it does not fall freely
-    assert release_time(motion([1 - x for x in fall], [1.0] + [0.0] * 11)) == 0  # it is lost at once
+    assert release_time(motion([1 - x for x in fall], [1.0] + [0.0] * 11)) == 0  # it is lost immediately
 
 
 def test_a_sighting_between_lost_frames_must_last():

@@ -1,4 +1,4 @@
-"""Simple motions for the tests of training."""
+"""Simple motions for tests of training."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ FLOOR = BOX[0][2]
 
 
 def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, seed: int = 0) -> KeypointMotions:
-    """Balls of points that fall from different heights and stay where their lowest point meets the floor."""
+    """Balls of points that fall from different heights and stop when their lowest point reaches the floor."""
     rng = torch.Generator().manual_seed(seed)
     shape = 0.1 * torch.nn.functional.normalize(torch.randn(scenes, objects, n, 3, generator=rng), dim=-1)
     centre = torch.rand(scenes, objects, 3, generator=rng) - 0.5
@@ -29,7 +29,7 @@ def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, see
 
 
 def without_last(motions: KeypointMotions) -> KeypointMotions:
-    """The last object of scene 0 is padding."""
+    """The motions with the last object of scene 0 replaced by padding."""
     ids, points = motions.objects.clone(), motions.points.clone()
     ids[0, -1], points[0, :, -1] = -1, 0
     return replace(motions, objects=ids, points=points)

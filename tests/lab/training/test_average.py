@@ -1,4 +1,4 @@
-"""Averages of weights, and the runs in their cards."""
+"""Averages of weights, and the training runs in their cards."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.conftest import CliRunner
 
 
 def trained(path, seed, of="ngff", runs=()):
-    """Random weights with a card of one run after `runs`."""
+    """Save random weights with a card of one run after `runs`."""
     torch.manual_seed(seed)
     model = build(of, hidden=8)
     save(path, of, model, {"runs": [*runs, {"minutes": 2.0, "processes": 3}], "curve": {"minutes": [2.0]}})

@@ -16,7 +16,7 @@ CURVES = {"runs": [{"minutes": 1.0}], "curve": {"minutes": [], "loss": [], "RMSE
 
 
 def card(path, minutes=(1.0, 2.0), losses=(0.5, 0.25), earlier=()):
-    """A card of one run after `earlier`."""
+    """Write a card of one run after `earlier`."""
     scores = [x and x / 10 for x in losses]
     record = {"minutes": minutes[-1], "scenes": 7, "validation": {"RMSE": scores[-1], "R": 0.5}}
     curve = {"minutes": minutes, "loss": losses, "RMSE": scores, "R": [0.5] * len(losses)}
@@ -35,7 +35,7 @@ def test_curves_of_two_cards_in_one_figure(tmp_path):
     assert image.shape == (PANEL_HEIGHT + LEGEND_HEIGHT, 3 * PANEL_WIDTH, 3)
     assert (image[:PANEL_HEIGHT, :PANEL_WIDTH] == (40, 40, 200)).all(
         2
-    ).sum() > 50  # the curve of a; of b there is a point
+    ).sum() > 50  # the curve of card a; card b has only a point
 
 
 def test_the_minutes_of_earlier_runs_count(tmp_path):

@@ -1,4 +1,4 @@
-"""Clips of motions, and the loss of a rollout with its gradients."""
+"""Clips of motions, and the loss and gradient of a rollout."""
 
 from dataclasses import replace
 
@@ -32,24 +32,24 @@ def test_clips_start_with_the_velocity_of_free_fall(device):
     assert_close(points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
     assert_close(truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
     assert_close(speed[0], torch.zeros(2, 8, 3))
-    # central differences are exact for a parabola: only rounding of positions near 1, over 2 dt, is left
+    # central differences are exact for a parabola, up to rounding of positions near 1, divided by 2 dt
     assert_close(speed[1], torch.tensor([0.0, 0.0, GRAVITY[2] * 2 * DT]).expand(2, 8, 3), rtol=0, atol=1e-5)
 
 
 def test_clips_end_within_the_motion(device):
     sampler, rng = untrained_sampler(falling(frames=5), device), torch.Generator().manual_seed(0)
     starts = {float(sampler.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
-    assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
+    assert len(starts) == 2  # only frames 0 and 1 have 3 later frames
 
 
 def test_scenes_at_rest_are_continued_at_rest(device):
-    """One scene falls to its last frame, the other is at rest at its end."""
+    """One scene falls until its last frame, the other is at rest at its end."""
     motions = falling(frames=12)[:2]
     motions.points[1, 5:] = motions.points[1, 5:6]
     assert ends_at_rest(motions).tolist() == [False, True]
     sampler, rng = untrained_sampler(motions, device), torch.Generator().manual_seed(0)
     heights = sampler.draw(300, 9, rng).points[:, 0, 0, 2].cpu()
-    assert len(heights.unique()) == 3 + 6  # one starts in frames 0 to 2, the other also in those in which it rests
+    assert len(heights.unique()) == 3 + 6  # one scene starts in frames 0 to 2, the other also in its frames at rest
     assert float((heights == motions.points[1, 11, 0, 0, 2]).float().mean()) > 0.2
     late = sampler.take(torch.tensor([1]), torch.tensor([11]), 9)
     assert_close(late.truth.cpu(), motions.points[1:, 11:].expand(1, 9, 2, 8, 3))
@@ -57,7 +57,7 @@ def test_scenes_at_rest_are_continued_at_rest(device):
 
 
 def test_clips_do_not_begin_amid_an_impact(device):
-    """A ball hit between two frames, in which central differences are far from its velocity."""
+    """A ball is hit between two frames, at which central differences are far from its velocity."""
     motions = falling(frames=12)[:1]
     hit = torch.arange(12)[:, None, None, None] * torch.tensor([0.0, 0.0, 0.02])
     motions.points[:] = motions.points[:, :1] + torch.where(torch.arange(12)[:, None, None, None] < 5, 0.0, hit - 0.09)
@@ -80,19 +80,19 @@ def test_losses_of_known_errors():
     valid = torch.tensor([[[True] * 4, [False] * 4]])
     predicted = truth.clone()
     predicted[:, :, 0, :, 2] = 0.01
-    predicted[:, :, 1] = 7.0  # padding does not count
+    predicted[:, :, 1] = 7.0  # padding must not count
     spread = torch.tensor([[[0.0, 0.0, 0.04], [0.0, 0.0, 0.0]]])
     assert_close(keypoint_loss(predicted, truth, valid, "square", spread), torch.tensor(1 / 3))
     assert_close(keypoint_loss(predicted, truth, valid, "scene", spread), torch.tensor((1 / 3 + 0.01) ** 0.5))
     assert_close(keypoint_loss(predicted, truth, valid, "axes", spread), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
     relative = keypoint_loss(
         predicted, truth, valid, "relative", spread
-    )  # to 1 cm more than the spread, 5 cm being usual
+    )  # relative to the spread plus 1 cm; the reference is 5 cm
     assert_close(relative, torch.tensor((0.1 * 5 + 0.1 * 5 + 1.01**0.5) / 3))
 
 
 def test_velocity_loss_sees_oscillations():
-    """Velocities of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
+    """Velocities of 1 m/s with alternating signs cause no displacement. A frame during an impact does not count."""
     weighed = LossOptions("square", velocity_time=0.1)
     points = torch.zeros(1, 7, 1, 4, 3)
     valid, spread = torch.ones(1, 1, 4, dtype=torch.bool), torch.zeros(1, 1, 3)
@@ -102,7 +102,7 @@ def test_velocity_loss_sees_oscillations():
     assert_close(velocity_loss(ringing, points, valid, spread, DT, weighed), torch.tensor(10.0**2 / 3))
     points[:, 4:, ..., 2] = (
         2 * MAX_SPEED_CHANGE * DT * torch.arange(3)[None, :, None, None] + MAX_SPEED_CHANGE * DT * 2
-    )  # hit after frame 3
+    )  # it is hit after frame 3
     free = torch.zeros(1, 6, 1, 4, 3)
     free[:, 3:, ..., 2] = 2 * MAX_SPEED_CHANGE
     assert_close(velocity_loss(free, points, valid, spread, DT, weighed), torch.tensor(0.0), rtol=0, atol=1e-5)
@@ -110,9 +110,9 @@ def test_velocity_loss_sees_oscillations():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_gradients_match_autograd_of_the_rollout(name, device):
-    """The gradient through the prepared scene is chained by hand; autograd of the whole rollout is the reference."""
+    """The gradient through the prepared scene is computed by hand; the reference is autograd of the whole rollout."""
     torch.manual_seed(0)
-    model = build(name, hidden=8).to(device).eval()  # no dropout
+    model = build(name, hidden=8).to(device).eval()  # without dropout
     sampler = ClipSampler(without_last(falling()), device, model)
     clip = sampler.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
     loss, grads = RolloutLoss(model, DT)(clip)
@@ -121,14 +121,15 @@ def test_gradients_match_autograd_of_the_rollout(name, device):
     whole.backward()
     assert_close(loss, whole.detach())
     assert sum(float(g.abs().sum()) for g in grads) > 0
-    rounding = {"rtol": 1e-4, "atol": 1e-6} if device == "cpu" else {"rtol": 1e-3, "atol": 1e-5}  # sums in any order
+    # the order of sums varies
+    rounding = {"rtol": 1e-4, "atol": 1e-6} if device == "cpu" else {"rtol": 1e-3, "atol": 1e-5}
     for p, g in zip(model.parameters(), grads, strict=True):
         assert_close(g, torch.zeros_like(p) if p.grad is None else p.grad, **rounding)
 
 
 @pytest.mark.parametrize(("broken", "why"), [(True, "fails"), (False, "not finite")])
 def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why, device):
-    """Neither a failing compiler nor one with wrong gradients stops or spoils training."""
+    """Neither a failing compiler nor one with wrong gradients may stop or spoil training."""
 
     def compile(function, **_):
         def wrong(*given):
@@ -153,7 +154,7 @@ def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why, device)
 
 
 def test_gradient_discount_shrinks_gradients_of_early_frames(device):
-    """A gradient that goes back two frames is multiplied by 0.9^2."""
+    """With a discount of 0.9, a gradient that goes back two frames is multiplied by 0.9^2."""
     torch.manual_seed(0)
     model = build("gcn", hidden=8).to(device).eval()
     clip = ClipSampler(without_last(falling()), device, model).take(torch.tensor([0]), torch.tensor([0]), 3)
@@ -166,13 +167,13 @@ def test_gradient_discount_shrinks_gradients_of_early_frames(device):
     none, full = gradient(0.0), gradient(1.0)
     far = [(gradient(m) - none).norm() for m in (0.25, 0.5)]
     assert none.norm() > 0 and (full - none).norm() > 0
-    assert 2 <= far[1] / far[0] <= 4  # of one frame back half as much, of two a quarter
+    assert 2 <= far[1] / far[0] <= 4  # gradients over one frame are halved, over two frames quartered
 
 
 def test_absent_and_zero_forces_are_equal():
     world = without_last(falling()).initial_conditions()
     none, idle = ExternalForces.none_for(world.valid, world.points), ExternalForces.none(world)
-    # a push of no strength goes all the way that a real one goes
+    # a push of zero strength passes through the same code as a real one
     weak = replace(idle, object=idle.object.new_zeros(6, 1), point=idle.point.new_zeros(6, 1) - 1,
                    force=torch.zeros(6, 1, 3), torque=torch.zeros(6, 1, 3), start=torch.zeros(6, 1),
                    end=torch.ones(6, 1))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Training: steps, checkpoints, cards, and the command."""
+"""Training: steps, checkpoints, cards and the command."""
 
 import math
 import os
@@ -32,7 +32,7 @@ from tests.lab.training.motions import DT, falling, without_last
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A folder with two groups."""
+    """A folder with two groups of motions."""
     (tmp_path / "data" / "motions").mkdir(parents=True)
     for seed, name in enumerate(("3_0", "3_1")):
         made = {"command": f"made {name}"}
@@ -81,7 +81,7 @@ def test_missing_soap_package_is_reported(monkeypatch):
 
 
 def test_soap_minimises_an_ill_conditioned_quadratic():
-    """Condition number 1e6, rotated axes: SOAP finds the eigenvectors, where Adam would stall."""
+    """With condition number 1e6 and rotated axes, SOAP finds the eigenvectors, where Adam would stagnate."""
     rng = torch.Generator().manual_seed(0)
     turn = torch.linalg.qr(torch.randn(8, 8, generator=rng))[0]
     H = (turn * 10.0 ** torch.linspace(-3, 3, 8)) @ turn.T
@@ -117,7 +117,7 @@ def test_divergence_restarts_from_the_best_at_half_rate():
     state.record({"RMSE": 0.1})
     best = {k: v.clone() for k, v in state.best.items()}
     state.update(good, 1e-2)
-    state.record({"RMSE": 0.12})  # a little worse: so it goes
+    state.record({"RMSE": 0.12})  # slightly worse results do not cause a restart
     assert state.rate_factor == 1.0
     assert not all(torch.equal(v, best[k]) for k, v in state.model.state_dict().items())
     state.update(good, 1e-2)
@@ -128,7 +128,7 @@ def test_divergence_restarts_from_the_best_at_half_rate():
     state.update(good, 1e-2)
     assert state.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARMUP_STEPS)
     moved = max(float((p.detach() - best[n]).abs().max()) for n, p in state.model.named_parameters())
-    assert moved == pytest.approx(0.5e-2 / WARMUP_STEPS, rel=0.01)  # a first step of Adam: the moments were reset
+    assert moved == pytest.approx(0.5e-2 / WARMUP_STEPS, rel=0.01)  # the moments were reset, as in a first step of Adam
 
 
 @pytest.mark.parametrize(("after", "factor"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
@@ -149,12 +149,12 @@ def test_a_new_horizon_resets_moments_and_warm_up():
     state.start_horizon(20)
     state.update([100 * torch.ones_like(p) for p in state.params], 1e-2)
     step = max(float((p.detach() - q).abs().max()) for p, q in zip(state.params, before, strict=True))
-    assert step == pytest.approx(1e-2 / WARMUP_STEPS, rel=0.01)  # however much larger gradients have become
+    assert step == pytest.approx(1e-2 / WARMUP_STEPS, rel=0.01)  # independent of the size of the gradients
 
 
 @pytest.mark.usefixtures("device")
 def test_training_learns_free_fall(tmp_path):
-    """A graph network from scratch learns gravity."""
+    """A graph network learns gravity from scratch."""
     write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
     options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, width=16, groups="3_0")
     torch.manual_seed(options.seed)
@@ -177,14 +177,14 @@ def test_card_records_the_training(data, tmp_path, device):
     assert card["curve"]["horizon"] == [2, 2, 3, 3]
     unseen = train_validation_split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
     assert record["validation"]["RMSE"] == pytest.approx(min(card["curve"]["RMSE"]), rel=1e-4)
-    rounding = 1e-6 if device == "cpu" else 1e-2  # training on a GPU multiplies matrices in TF32
+    rounding = 1e-6 if device == "cpu" else 1e-2  # on a GPU, training multiplies matrices in TF32
     assert validate(model, unseen)["RMSE"] == pytest.approx(record["validation"]["RMSE"], rel=rounding)
 
 
 @pytest.mark.parametrize(("after", "optimizer"), [(1, "adamw"), (5, "adamw"), (5, "soap")])
 def test_resumed_training_repeats_the_curve(data, tmp_path, monkeypatch, after, optimizer):
-    options = replace(QUICK, optimizer=optimizer, device="cpu")  # where results repeat to the bit
-    run("pointformer", data, tmp_path / "whole.safetensors", options)  # with dropout
+    options = replace(QUICK, optimizer=optimizer, device="cpu")  # results on the CPU are exactly repeatable
+    run("pointformer", data, tmp_path / "whole.safetensors", options)  # includes dropout
     with monkeypatch.context() as patch:
         update = TrainingState.update
 
@@ -205,7 +205,7 @@ def test_resumed_training_repeats_the_curve(data, tmp_path, monkeypatch, after, 
         return dict(zip(card["curve"]["step"], zip(*columns, strict=True), strict=True))
 
     extra = rows(parts).keys() - rows(whole).keys()
-    assert len(extra) == (after == 1)  # stopped before the first validation: one is needed to save weights at all
+    assert len(extra) == (after == 1)  # a stop before the first validation adds one, which is needed to save weights
     assert rows(whole) == {step: row for step, row in rows(parts).items() if step not in extra}
     for p, q in zip(a.parameters(), b.parameters(), strict=True):
         assert torch.equal(p, q)
@@ -310,9 +310,9 @@ def test_the_command_trains(data, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_equal_one_with_the_whole_batch(data, tmp_path):
-    """Each computes half of every batch and gradients are averaged: only the order of sums differs.
+    """Each process computes half of every batch and gradients are averaged, so only the order of sums differs.
 
-    On the CPU, since two processes cannot share one GPU.
+    It runs on the CPU, because two processes cannot use one GPU.
     """
     words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
     words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--width", "8"]

@@ -1,4 +1,4 @@
-"""Training of the splat head: it improves, and the rest of the network does not change."""
+"""Training of the splat head: it improves, and the other weights of the network do not change."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ from tests.reconstruct.raycast import arc, photograph, write_set
 
 @pytest.fixture
 def folder(tmp_path):
-    """One scene of two balls with eight cameras."""
+    """A folder with one scene of two balls and eight cameras."""
     (tmp_path / "data").mkdir()
     write_scene(tmp_path / "data/balls.ply", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)))
     return tmp_path / "data"
@@ -73,8 +73,8 @@ def test_true_depth_gives_points_on_the_surface(device):
     world = (geometry.points @ geometry.poses[:, None, :3, :3].mT + geometry.poses[:, None, None, :3, 3]).cpu()
     known = scene.depths > 0
     assert known.float().mean() > 0.5
-    on_floor = world[known][:, 2].abs() < 0.025  # drawn depth is that of the centres of discs 4 cm wide
-    assert on_floor.float().mean() > 0.5  # most of what is seen is the floor at z = 0
+    on_floor = world[known][:, 2].abs() < 0.025  # drawn depth is that of the centres of discs of 4 cm
+    assert on_floor.float().mean() > 0.5  # most of the image is the floor at z = 0
     back = depths(world[0][known[0]], scene.viewmats[0])
     torch.testing.assert_close(back, scene.depths[0][known[0]], rtol=1e-4, atol=1e-4)
 
@@ -103,7 +103,7 @@ def test_inconsistent_options_are_reported(folder, tmp_path):
 
 def test_predicted_depth_is_scaled_to_the_given_cameras():
     cameras = arc(4, (56, 42))
-    predicted = truth(cameras, scale=3.7)  # in a frame and unit of its own
+    predicted = truth(cameras, scale=3.7)  # in a different frame and unit
     encoder = SimpleNamespace(tokens=lambda *_: (None, None), geometry=lambda *_: predicted)
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
     views = PosedViews("table", images, cameras.viewmats, cameras.Ks, None)

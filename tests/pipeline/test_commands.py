@@ -32,13 +32,13 @@ PIPELINE = ("reconstruct", "segment", "refine", "simulate", "render", "evaluate"
 
 
 def call(*args, app=app) -> tuple[int, str, str]:
-    """Exit status, stdout and stderr of `ngff ARGS`, or of the command line `app`."""
+    """Exit status, stdout and stderr of `ngff ARGS`, or of another Typer `app` with these arguments."""
     done = CliRunner().invoke(app, [str(a) for a in args])
     return done.exit_code, done.stdout, done.stderr
 
 
 def all_commands(app, prefix=()):
-    """(words, callback) of every command of a Typer app and its sub-apps."""
+    """Yield the words and the callback of every command of a Typer app and its sub-apps."""
     for command in app.registered_commands:
         yield (*prefix, command.name or command.callback.__name__), command.callback
     for group in app.registered_groups:
@@ -50,7 +50,7 @@ COMMANDS = {" ".join(words): callback for words, callback in
 
 
 def first_paragraph(callback) -> str:
-    """Of the docstring, on one line."""
+    """The first paragraph of the docstring, on one line."""
     return " ".join(inspect.getdoc(callback).split("\n\n")[0].split())
 
 
@@ -72,7 +72,7 @@ class Some:
     flag: bool = option(False, "a flag")
     on: bool = option(True, "with a form for no")
     few: int = option(3, "up to five", max=5)
-    inner: int = 7  # for Python alone
+    inner: int = 7  # a field that is not an option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +109,7 @@ def test_numbers_that_no_option_takes(line):
 
 
 def counts():
-    """(option class, field) of each option that is an integer, of all commands."""
+    """Pairs (option class, field) of all integer options of all commands."""
     for callback in COMMANDS.values():
         for cls in typing.get_type_hints(inspect.unwrap(callback)).values():
             if dataclasses.is_dataclass(cls):
@@ -143,7 +143,7 @@ def test_benchmarks_run_what_they_name(name, run, monkeypatch):
 
 
 def test_options_that_are_given_are_told_from_those_that_are_not(monkeypatch, tmp_path):
-    """A recording (--forces) does not replace an option that is given with its default value."""
+    """A recording (--forces) does not replace an option that was given, even with its default value."""
     seen = []
     monkeypatch.setattr(commands, "load", lambda entry: lambda *arguments: seen.append(arguments))
     assert call("simulate", tmp_path / "a.ply", "--gravity", "9.81")[0] == 0
@@ -175,7 +175,7 @@ def test_every_command_and_option_is_documented(name):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_an_empty_path_is_an_error(name):
-    """Path("") would be the current folder."""
+    """Otherwise Path("") would be the current folder."""
     script, *words = name.split()
     script = {"ngff": app, "ngff-lab": lab_app}[script]
     command = typer.main.get_command(script)
@@ -205,12 +205,12 @@ def test_shell_completion(name, script, monkeypatch):
 
 
 def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
-    """Each on the output of the one before, on a named device."""
+    """Each command uses the output of the preceding one, on a given device."""
     draft = dataclasses.replace(QUALITY_PRESETS["draft"], gaussians=2000)
     monkeypatch.setitem(QUALITY_PRESETS, "draft", draft)
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # one of three
     monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
-    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # one instead of four
     cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
     scene, labelled, refined, motion = (tmp_path / name for name in ("a.ply", "b.ply", "c.ply", "t.h5"))
     quick = "--quality", "draft"
@@ -231,7 +231,7 @@ def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
     assert status == 0 and json.loads(out) == json.loads((tmp_path / "metrics.json").read_text()), err
     status, out, err = call("evaluate", motion, "--against", motion)
     assert out.split()[:2] == ["MSE", "RMSE"]
-    (found,) = read_scene(labelled).objects  # the block; its texture is noise, which has no certain colour
+    (found,) = read_scene(labelled).objects  # the block; its texture is noise without a definite colour
     assert status == 0 and found.name in out, err
 
 

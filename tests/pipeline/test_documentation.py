@@ -1,4 +1,4 @@
-"""Documentation: relative links lead to existing files and headings, and command lines parse."""
+"""Documentation: relative links refer to existing files and headings, and command lines are valid."""
 
 import json
 import re
@@ -20,12 +20,12 @@ FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 INDENTED = re.compile(r"^(?: {4}|\t)(.*)$", re.M)
 INLINE = re.compile(r"`([^`]+)`", re.S)
 WORD_CHARACTERS = re.compile(r"[^\w\- ]")
-PLACEHOLDER = re.compile(r"[A-Z_]+|\.\.\.")  # stands for any command
+PLACEHOLDER = re.compile(r"[A-Z_]+|\.\.\.")  # can stand for any command
 
 
 @cache
 def anchors(page: Path) -> set[str]:
-    """Anchors of the headings of a page, as GitHub derives them."""
+    """Anchors of the headings of a page, computed as by GitHub."""
     text = FENCE.sub("", page.read_text())
     headings = re.findall(r"^#+ (.*)$", text, re.M)
     return {WORD_CHARACTERS.sub("", h.replace("`", "").strip().lower()).replace(" ", "-") for h in headings}
@@ -51,7 +51,7 @@ def commands() -> dict:
 
 
 def command_lines(text: str) -> list[str]:
-    """Lines that start with `ngff` or `ngff-lab` in code blocks, and such inline code."""
+    """Lines in code blocks that start with `ngff` or `ngff-lab`, and inline code that does."""
     blocks = FENCE.findall(text)
     lines = [line for block in blocks for line in re.sub(r"\\\n\s*", " ", block).splitlines()]
     rest = FENCE.sub("", text)
@@ -76,7 +76,7 @@ def unknown_part(line: str) -> str | None:
             if option is not None and "=" not in word and not option.is_flag and words:
                 words = words[1:]
         elif hasattr(command, "commands"):
-            if PLACEHOLDER.fullmatch(name) or "/" in name:  # "simulate/render" in prose
+            if PLACEHOLDER.fullmatch(name) or "/" in name:  # "simulate/render" occurs in prose
                 return None
             if name not in command.commands:
                 return name
@@ -97,7 +97,8 @@ def test_recipe_of_the_shipped_weights_consists_of_commands():
     for line in recipe:
         assert unknown_part(line) is None and line.startswith("ngff-lab "), line
         words = shlex.split(line)
-        assert {w for w in words if w.endswith(".safetensors")} - {words[-1]} <= made, line  # inputs come first
+        # inputs must be made by earlier lines
+        assert {w for w in words if w.endswith(".safetensors")} - {words[-1]} <= made, line
         made.add(words[-1])
     assert words[-1] == "ngff.safetensors"
 

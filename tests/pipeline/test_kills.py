@@ -1,6 +1,6 @@
-"""Commands that are killed, interrupted, or out of disk space or memory at random moments leave no part of a file.
+"""Commands that are killed, interrupted, or run out of disk space or memory at random moments leave no partial files.
 
-`NGFF_KILLS=200 python -m pytest -s -m slow tests/pipeline/test_kills.py` tries so many moments and prints a table.
+`NGFF_KILLS=200 python -m pytest -s -m slow tests/pipeline/test_kills.py` tests 200 moments and prints a table.
 """
 
 import multiprocessing
@@ -32,10 +32,10 @@ from tests.reconstruct.raycast import arc, write_set
 
 MOMENTS = int(os.environ.get("NGFF_KILLS", 16))
 HOWS = ("SIGKILL", "SIGINT", "SIGTERM", "full disk", "no memory")
-HANGING = 600.0  # a process that takes so long hangs [s]
+HANGING = 600.0  # a process that takes this long counts as hanging [s]
 NO_LIMIT = resource.RLIM_INFINITY
 SIMULATE = "simulate scene.ply --keypoints 16 --steps 20 --lift 0.2"
-COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after the disturbed one
+COMMANDS = {  # arguments of ngff or ngff-lab; `--resume` is added to the run after the disturbed one
     "reconstruct": "reconstruct images -o out/scene.ply --cameras transforms.json --quality draft",
     "segment": "segment scene.ply -o out/labelled.ply",
     "refine": "refine scene.ply -o out/refined.ply",
@@ -49,37 +49,38 @@ COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after 
     "dataset": "dataset out --groups 3_9 --parts scenes,motions --frames 3 --keypoints 64 --dx .08 --spacing .04 "
                "--substep 2e-3 --exact",
 }  # fmt: skip
-RESUMED = {"reconstruct": ".steps-scene.ply", "train": "w.ckpt"}  # where there is such a file
+RESUMED = {"reconstruct": ".steps-scene.ply", "train": "w.ckpt"}  # only if the file exists
 
 
 def memory(key: str, process: int | str = "self") -> int:
-    """VmSize, the memory that a process has mapped, or VmPeak, the largest so far [bytes]."""
+    """Memory of a process [bytes]: VmSize is the currently mapped size, VmPeak the largest so far."""
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    except (FileNotFoundError, ProcessLookupError):  # its parent, the fork server, has just taken note of its end
+    except (FileNotFoundError, ProcessLookupError):  # its parent, the fork server, has just collected its exit status
         return 0
-    return next((int(line.split()[1]) << 10 for line in lines if line.startswith(key)), 0)  # 0 once it has ended
+    # 0 after the process has ended
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith(key)), 0)
 
 
 def work(begun, command: str, words: list[str], folder: Path, largest: int, more: int) -> None:
-    """Run a command in a process of its own, which can write `largest` bytes per file and map `more` bytes."""
+    """Run a command in a separate process that can write `largest` bytes per file and map `more` bytes."""
     try:
         begun.set()
         run(command, words, folder, largest, more)
-    except KeyboardInterrupt:  # before the command line catches it
+    except KeyboardInterrupt:  # raised before the command line catches it
         sys.exit(130)
 
 
 def run(command: str, words: list[str], folder: Path, largest: int, more: int) -> None:
-    """Limit this process, make the work small, and run the command."""
+    """Set the limits of this process, reduce the amount of work, and run the command."""
     os.chdir(folder)
     os.environ["TMPDIR"] = str(folder / "tmp")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(os.open("errors" if largest == NO_LIMIT else os.devnull, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background of a shell ignore it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes of a shell ignore it by default
     small = {"gaussians": 1000, "iterations": 5}
     QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
-    sys.dont_write_bytecode = True  # of which Python before 3.12.8 would keep what fits
+    sys.dont_write_bytecode = True  # Python before 3.12.8 would keep truncated bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     shrink_process()
     if more != NO_LIMIT:
@@ -89,16 +90,16 @@ def run(command: str, words: list[str], folder: Path, largest: int, more: int) -
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """What a command writes, how long it takes, and how much memory it maps beyond that of its parent."""
+    """Results of a command without disturbance: its files, duration, and mapped memory beyond that of its parent."""
 
     inputs: Path
     files: dict[str, bytes]
     seconds: float
-    mapped: int  # [bytes]
+    mapped: int  # memory [bytes]
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
-    """The files below a folder; of videos, and of training times, which differ between runs, what does not."""
+    """The files below a folder; for videos and training times, which differ between runs, only their constant part."""
     found = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         name = str(path.relative_to(folder))
@@ -110,7 +111,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 
 def start(command: str, folder: Path, resume: bool = False, largest: int = NO_LIMIT, more: int = NO_LIMIT):
-    """A process that has begun to run a command in a folder; its limits are those of `work`."""
+    """Start a process that runs a command in a folder, and wait until it begins; its limits are those of `work`."""
     (folder / "out").mkdir(exist_ok=True)
     (folder / "tmp").mkdir(exist_ok=True)
     resume = resume and command in RESUMED and (folder / "out" / RESUMED[command]).exists()
@@ -118,7 +119,7 @@ def start(command: str, folder: Path, resume: bool = False, largest: int = NO_LI
     begun = CONTEXT.Event()
     process = CONTEXT.Process(target=work, args=(begun, command, words, folder, largest, more))
     process.start()
-    begun.wait(HANGING)  # a signal while Python starts is not the command's to catch
+    begun.wait(HANGING)  # signals during the start of Python cannot be caught by the command
     return process
 
 
@@ -141,7 +142,7 @@ def inputs(tmp_path_factory):
 
 
 def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, folder: Path) -> tuple[str, str]:
-    """Run a command, disturb it, and run it again; what became of it, and what is wrong with what it left."""
+    """Run a command, disturb it, and run it again; returns how it ended, and errors in the files that it left."""
     shutil.copytree(known.inputs, folder)
     if how == "full disk":
         process = start(command, folder, largest=int(rng.uniform(0, 1.05 * max(map(len, known.files.values())))))
@@ -153,7 +154,7 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
         if process.is_alive():
             os.kill(process.pid, getattr(signal, how))
     process.join(HANGING)
-    process.kill()  # if it hangs
+    process.kill()  # in case it hangs
     process.join()
     code, wrong, errors = process.exitcode, [], folder / "errors"
     errors = errors.read_text(errors="replace") if errors.exists() else ""
@@ -181,7 +182,7 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
 
 
 def run_undisturbed(command: str, inputs: Path, folder: Path) -> Undisturbed:
-    """Run a command to its end."""
+    """Run a command without disturbance."""
     shutil.copytree(inputs, folder)
     begun = time.monotonic()
     process = start(command, folder)
@@ -214,12 +215,12 @@ def test_nothing_is_left_in_parts(inputs, tmp_path):
 
 
 def test_an_interrupt_waits_until_an_import_has_ended(monkeypatch):
-    """Raised in a callback of the import system it would be ignored, and the lock of imports would stay taken."""
+    """In a callback of the import system it would be ignored, and the lock of imports would not be released."""
     before, alarms = signal.getsignal(signal.SIGALRM), []
     monkeypatch.setattr(signal, "setitimer", lambda *alarm: alarms.append(alarm))
     importing = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
     imported = SimpleNamespace(f_code=SimpleNamespace(co_filename="library.py"), f_back=importing)
-    running = SimpleNamespace(f_code=run_command_line.__code__, f_back=importing)  # within a script that is imported
+    running = SimpleNamespace(f_code=run_command_line.__code__, f_back=importing)  # in a script that is being imported
     try:
         for frame in (sys._getframe(), running):
             with pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""Structure of the code: order of imports between folders, unique class names, and imports of the command line."""
+"""Structure of the code: order of imports between folders, unique class names, and imports by the command line."""
 
 import ast
 import subprocess
@@ -24,7 +24,7 @@ CORE = [
     "player",
 ]
 STAGES = {"reconstruct", "segment", "refine", "simulate", "render", "evaluate"}
-HEAVY = {"torch", "warp", "cv2", "pycolmap", "h5py", "numpy"}  # packages that take long to import
+HEAVY = {"torch", "warp", "cv2", "pycolmap", "h5py", "numpy"}  # packages whose import takes long
 
 
 def folder(module: str) -> str:
@@ -34,7 +34,7 @@ def folder(module: str) -> str:
 
 
 def imported_modules(tree: ast.Module) -> set[str]:
-    """All imports of a file, at any level: modules, and names in them."""
+    """All imports of a file, at any level: modules, and names imported from them."""
     names = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -45,7 +45,7 @@ def imported_modules(tree: ast.Module) -> set[str]:
 
 
 def imported_folders(tree: ast.Module) -> set[str]:
-    """Folders of all imports of a file from stages."""
+    """Folders of all modules in stages that a file imports."""
     return {folder(name) for name in imported_modules(tree) if name.startswith("stages.")}
 
 
@@ -57,7 +57,7 @@ def trees() -> dict[str, ast.Module]:
 
 
 def allowed_imports(home: str) -> set[str]:
-    """Folders from which files of a folder may import."""
+    """Folders from which the files of a folder may import."""
     core = [f"core.{name}" for name in CORE]
     above = core[: core.index(home)] if home in core else core
     return {*above, home, *(STAGES if home == "lab" else ())}
@@ -71,7 +71,7 @@ def test_folders_import_only_from_folders_above_them(trees):
 
 @pytest.mark.parametrize("home", ["stages.lab", "stages.core.models"])
 def test_no_two_subfolders_import_from_each_other(trees, home):
-    """Nor do three or more in a circle. `home` itself, with the files beside its subfolders, counts as one of them."""
+    """Longer cycles are not allowed either. The files directly in `home` count as one subfolder."""
 
     def part(module: str) -> str:
         name = module.removeprefix(f"{home}.").split(".")[0]
@@ -82,7 +82,7 @@ def test_no_two_subfolders_import_from_each_other(trees, home):
         if module.startswith(f"{home}."):
             others = {part(name) for name in imported_modules(tree) if name.startswith(f"{home}.")}
             graph.setdefault(part(module), set()).update(others - {part(module)})
-    tuple(TopologicalSorter(graph).static_order())  # raises CycleError
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError if there is a cycle
 
 
 def test_no_file_outside_the_list_of_folders(trees):

@@ -1,4 +1,4 @@
-"""Files of any name, in folders that cannot be written, in any locale."""
+"""Files of any name, in folders that cannot be written, and in any locale."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from tests.pipeline.test_commands import ROOT, call
 
 
 def commands(scene: Path, out: Path) -> list[list]:
-    """Command lines that write trajectories, pages, pictures and reports of a scene."""
+    """Command lines that write trajectories, pages, images and reports of a scene."""
     t, film = out / "t ü.h5", out / "f ü.html"
     return [
         ["simulate", scene, "--engine", "rigid", "--steps", "2", "--keypoints", "16", "-o", t],

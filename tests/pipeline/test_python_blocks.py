@@ -1,6 +1,6 @@
-"""Python blocks of the documentation run as they stand.
+"""Python blocks of the documentation run without changes.
 
-The stages read and write their files as usual; only structure from motion with its fit, and the physics, are replaced.
+The stages read and write real files; only the backend of `reconstruct` and the engine of `simulate` are replaced.
 """
 
 import re
@@ -26,14 +26,14 @@ BLOCKS = {str(page.relative_to(ROOT)): block for page in PAGES
 
 
 def reconstruct_two_balls(photos, options, steps) -> Reconstruction:
-    """The backend `classic` of `reconstruct` during this test."""
+    """Replaces the backend `classic` of `reconstruct`."""
     scene = replace(two_balls_scene(), background=(0.0, 0.0, 0.0))
     cameras = scene.cameras[list(range(len(photos)))]
     return Reconstruction(scene, Views(photos.images, cameras), list(range(len(photos))), [], {}, [])
 
 
 def hold_still(scene, keypoints, prompts, options) -> Iterator[FrameState]:
-    """The engine `rigid` of `simulate` during this test: two frames without motion."""
+    """Replaces the engine `rigid` of `simulate`; yields two frames without motion."""
     centres = torch.stack([keypoints.rest[keypoints.object_id == o.id].mean(0) for o in scene.objects])
     for _ in range(2):
         yield FrameState(keypoints.rest, centres, torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1))
@@ -41,7 +41,7 @@ def hold_still(scene, keypoints, prompts, options) -> Iterator[FrameState]:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, two_balls):
-    """The current folder, with the files that the blocks begin with."""
+    """The current folder, with the files that the blocks use."""
     monkeypatch.setitem(BACKENDS, "classic", f"{__name__}:reconstruct_two_balls")
     monkeypatch.setitem(ENGINES, "rigid", Engine(f"{__name__}:hold_still", ""))
     monkeypatch.chdir(tmp_path)

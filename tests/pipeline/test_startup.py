@@ -1,4 +1,4 @@
-"""What each command imports from start to end: packages that it does not use would add seconds to short runs."""
+"""Imports by each command during a complete run; packages that it does not use would add seconds to short runs."""
 
 import json
 import os
@@ -17,8 +17,8 @@ from tests.conftest import two_balls_scene
 from tests.reconstruct.raycast import arc, write_set
 
 ROOT = Path(__file__).resolve().parents[2]
-# no command compiles with PyTorch (`import torch` itself imports torch.distributed, but not these) or solves ODEs;
-# gsplat is for comparisons
+# no command compiles with PyTorch (`import torch` itself imports torch.distributed, but none of these) or solves ODEs;
+# gsplat is used only for comparisons
 COMPILERS = {"torch._dynamo", "torch._inductor", "torch.distributed.fsdp", "torch.onnx", "sympy"}
 UNUSED = {*COMPILERS, "gsplat", "torchdiffeq", "scipy.interpolate", "transformers", "diffusers", "av"}
 
@@ -34,12 +34,12 @@ COMMANDS = {
     "render traj.h5 --resolution 32 -o out.png": {"pycolmap", "scipy.optimize"},
     "evaluate traj.h5 --against traj.h5 -o out.json": {"cv2", "pycolmap", "scipy", "warp"},
 }
-SLOW_COMMANDS = {  # the same stages with scenes
+SLOW_COMMANDS = {  # the same stages with scenes instead of trajectories
     "render scene.ply --resolution 32 -o out.png": {"pycolmap", "scipy"},
     "evaluate scene.ply --against scene.ply -o out.json": {"cv2", "h5py", "pycolmap", "warp"},
 }
 
-# PyTorch and the command line, which every command needs, are imported once; each runs in a fork of that process
+# PyTorch and the command line, which every command needs, are imported once; each command runs in a fork of the process
 RUNNER = """
 import json, os, sys, traceback
 import ngff_cli.app, torch
@@ -66,7 +66,7 @@ def inputs(tmp_path_factory, device) -> Path:
     """A folder with a scene, a trajectory and a photo set with cameras."""
     folder = tmp_path_factory.mktemp("inputs")
     scene = two_balls_scene()
-    near = (scene.gaussians.means[:, :2].abs() < 0.6).all(1)  # the balls, and a third of the floor
+    near = (scene.gaussians.means[:, :2].abs() < 0.6).all(1)  # the balls and a third of the floor
     write_scene(folder / "scene.ply", replace(scene, gaussians=scene.gaussians[near]))
     simulate(folder / "scene.ply", folder / "traj.h5", SimulateOptions(steps=3, quality="draft", device=device))
     (folder / "set").mkdir()
@@ -91,7 +91,7 @@ def test_commands_do_not_import_what_they_do_not_use(inputs, device, chosen):
 @pytest.mark.parametrize("script", ["ngff", "ngff_lab"])
 @pytest.mark.parametrize("interrupted", ["builtins.__import__", "signal.signal"])
 def test_an_interrupt_before_the_command_line_catches_it_ends_in_one_line(script, interrupted):
-    """While it is imported, and just after."""
+    """The interrupt occurs while the command line is imported, or directly after it."""
     code = f"""
 import builtins, signal, sys
 from ngff_cli import {script}

@@ -1,4 +1,4 @@
-"""Threads wait passively and NumPy uses one: set before the libraries that read these variables are imported."""
+"""Threads wait passively, and NumPy uses one: variables for this are set before importing libraries that read them."""
 
 import json
 import os
@@ -24,7 +24,7 @@ sys.meta_path.insert(0, Recorder)
 
 
 def environment_at_import(statement: str, **given: str) -> dict[str, str | None]:
-    """VARIABLES as they are when a new process begins to import PyTorch or NumPy."""
+    """Values of VARIABLES when a new process begins to import PyTorch or NumPy."""
     code = f"VARIABLES = {list(VARIABLES)}{RECORDER}{statement}"
     env = {name: value for name, value in os.environ.items() if name not in VARIABLES} | given
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=env, check=True)

@@ -65,12 +65,12 @@ WRONG = [
 
 @pytest.fixture(autouse=True)
 def quick_segmentation(monkeypatch):
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes time
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # one of three, each of which takes time
 
 
 @pytest.fixture(scope="module")
 def made_files(tmp_path_factory, device):
-    """A valid scene and trajectory, and files that are absent, empty, truncated, or of another format."""
+    """A valid scene and trajectory, and files that are missing, empty, truncated, or have a different format."""
     folder = tmp_path_factory.mktemp("wrong")
     for name in ("empty", "damaged"):
         (folder / name).mkdir()
@@ -90,13 +90,13 @@ def made_files(tmp_path_factory, device):
 
 @pytest.fixture
 def input_files(made_files, monkeypatch):
-    """The folder of these files, which is the working directory."""
+    """The folder of these files, set as the working directory."""
     monkeypatch.chdir(made_files)
     return made_files
 
 
 def fails_cleanly(words: str, command=call, expected=2) -> str:
-    """Assert one line on stderr, the expected status, empty stdout and no new file; return the line on stderr."""
+    """Assert one line on stderr, the expected status, empty stdout and no new file; returns the line on stderr."""
     before = sorted(p.name for p in Path.cwd().iterdir())
     status, out, err = command(*words.split())
     lines = [line for line in err.splitlines() if line.startswith("ngff: ")]
@@ -130,11 +130,11 @@ def work(*_, **__):
     pytest.fail("the work has begun")
 
 
-WORK = {  # of each stage: function that is called after the output is checked, and what it is replaced by
+WORK = {  # for each stage, the function that is called after the check of the output, and its replacement
     "reconstruct": ("read_photos", work), "segment": ("choose", lambda *_: work), "refine": ("refine", work),
     "simulate": ("with_objects", work), "render": ("load", lambda *_: work), "evaluate": ("load", lambda *_: work),
 }  # fmt: skip
-SOURCES = {"evaluate": "good.h5 --against good.h5"}  # of the other stages good.ply
+SOURCES = {"evaluate": "good.h5 --against good.h5"}  # other stages use good.ply
 
 
 @pytest.mark.parametrize(("out", "message"), [("nowhere/o{}", "no folder"), ("empty", "is a folder"),
@@ -234,7 +234,7 @@ def test_out_of_memory_gives_one_line_and_status_1(monkeypatch, allocate):
 
 
 def test_out_of_memory_names_only_options_that_the_command_has(monkeypatch):
-    """`bench track` shows its field `quality` as --reconstructed."""
+    """The field `quality` of `bench track` is the option --reconstructed."""
 
     def exhausted(*_):
         raise MemoryError

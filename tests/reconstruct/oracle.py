@@ -1,4 +1,4 @@
-"""The output of a perfect network for ray-cast photos: true point maps, poses and Gaussians."""
+"""Output of a perfect network for ray-cast photos: true point maps, poses and Gaussians."""
 
 import torch
 
@@ -15,13 +15,13 @@ C0 = 0.28209479177387814
 
 
 def photos_of(cameras: Cameras, folder) -> Photos:
-    """The ray-cast photos of these cameras."""
+    """Ray-cast photos by these cameras."""
     images = tuple(torch.from_numpy(to_bytes(photograph(cameras, i)[0])) for i in range(len(cameras)))
     return Photos(images, cameras.names, (0.0,) * len(cameras), folder)
 
 
 def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
-    """True point maps and poses, randomly rotated, shifted and scaled by `scale`."""
+    """True point maps and poses, randomly rotated, shifted, and scaled by `scale`."""
     R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)))[0]
     R = R * torch.linalg.det(R)
     points, poses = [], []
@@ -39,11 +39,11 @@ def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
 
 
 def true_splats(photos: Photos, size: tuple[int, int], geometry: Geometry, focal: float) -> torch.Tensor:
-    """Raw parameters of nearly opaque Gaussians as large as a pixel, in its colour."""
+    """Raw parameters of nearly opaque Gaussians with the size and colour of a pixel."""
     images = network_input.make_batch(list(photos.images), size).permute(0, 2, 3, 1)
     raw = torch.zeros(*images.shape[:3], CHANNELS)
     raw[..., 0] = 4.0
-    wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # the output of softplus
+    wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # output of the softplus
     raw[..., 1:4] = torch.where(wanted > 20, wanted, wanted.expm1().clamp_min(1e-6).log())[..., None]
     raw[..., 7] = 1.0
     raw[..., 8::9] = (images - 0.5) / C0

@@ -1,4 +1,4 @@
-"""Ray-cast photos of a textured table with a block on it, with exact depth and cameras."""
+"""Ray-cast photos of a textured table with a block on it, with exact depth and known cameras."""
 
 import json
 from pathlib import Path
@@ -10,11 +10,11 @@ from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import write_png
 
-BLOCK = (0.25, 0.2, 0.2)  # half sides along x and y, height; at the origin
+BLOCK = (0.25, 0.2, 0.2)  # half sides along x and y, and height; the block is at the origin
 
 
 def arc(count: int = 6, size: tuple[int, int] = (160, 120), sweep: float = 60.0) -> Cameras:
-    """Cameras on an arc around the block, looking down at 35 degrees."""
+    """Cameras on an arc around the block, inclined downwards by 35 degrees."""
     viewmats = orbit(count, torch.tensor([0.0, 0.0, 0.05]), 1.6, elevation=35.0, azimuth=200.0, sweep=sweep)
     K = intrinsics(*size, focal=1.2 * size[0])
     names = tuple(f"photo_{i:02d}.png" for i in range(count))
@@ -22,7 +22,7 @@ def arc(count: int = 6, size: tuple[int, int] = (160, 120), sweep: float = 60.0)
 
 
 def texture(u: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
-    """Colour (..., 3) at surface coordinates: noise at four scales, so that every window has texture."""
+    """Colour (..., 3) at surface coordinates: noise at four scales, so that every image window has texture."""
     generator = torch.Generator().manual_seed(seed)
     colour = 0
     for octave in (16, 48, 96, 160):
@@ -34,7 +34,7 @@ def texture(u: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
 
 
 def rays_of(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """The centre of a camera and the ray of each pixel (h, w, 3), up to depth 1."""
+    """The centre of a camera, and the ray of each pixel (h, w, 3) scaled to depth 1."""
     (width, height), K, viewmat = cameras.sizes[i].tolist(), cameras.Ks[i], cameras.viewmats[i]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1) @ viewmat[:3, :3]
@@ -62,7 +62,7 @@ def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def with_mirror(cameras: Cameras, i: int, position: float = -0.5) -> torch.Tensor:
-    """The photo with a vertical mirror at x = `position`, rendered by the mirrored camera."""
+    """The photo with a vertical mirror at x = `position`, for which the mirrored camera is used too."""
     image, depth = photograph(cameras, i)
     eye, rays = rays_of(cameras, i)
     reflection = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
@@ -75,7 +75,7 @@ def with_mirror(cameras: Cameras, i: int, position: float = -0.5) -> torch.Tenso
 
 
 def write_set(folder: Path, cameras: Cameras) -> Path:
-    """Photos in folder/images and their cameras in folder/transforms.json, which is returned."""
+    """Write photos to folder/images and their cameras to folder/transforms.json, whose path is returned."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for i, name in enumerate(cameras.names):

@@ -1,4 +1,4 @@
-"""Advice for known camera positions; scale references."""
+"""Advice for known camera positions, and scale references."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def test_no_advice_for_a_good_set():
 
 
 def test_widest_gap_is_named_by_the_photos_at_its_ends():
-    # 13 photos 20 degrees apart span 240 degrees; the gap is from the last to the first.
+    # 13 photos at intervals of 20 degrees span 240 degrees, with a gap from the last to the first
     cameras = ring(13, sweep=260.0)
     gap, before, after = widest_gap(cameras, torch.zeros(3))
     assert gap == pytest.approx(120, abs=0.1) and {before, after} == {"0.jpg", "12.jpg"}
@@ -38,7 +38,7 @@ def test_widest_gap_is_named_by_the_photos_at_its_ends():
 
 
 def test_gap_across_azimuth_zero():
-    cameras = ring(10, sweep=300.0, azimuth=100.0)  # 30 degrees apart
+    cameras = ring(10, sweep=300.0, azimuth=100.0)  # at intervals of 30 degrees
     assert widest_gap(cameras, torch.zeros(3))[0] == pytest.approx(90, abs=0.1)
 
 
@@ -72,7 +72,7 @@ def test_dropped_photos_are_named_with_limits():
 
 
 def test_scale_reference_between_two_cameras_or_to_the_focus():
-    cameras = ring(4)  # 90 degrees apart on a circle of radius 2 cos 30
+    cameras = ring(4)  # at intervals of 90 degrees on a circle of radius 2 cos 30
     known = parse_scale("photos=0.jpg,1.jpg distance=0.5")
     assert known.in_scene_units(cameras, 2.0) == pytest.approx(2 * 3**0.5 / 2 * 2**0.5, rel=1e-5)
     assert parse_scale("distance=0.6").in_scene_units(cameras, 2.0) == 2.0

@@ -1,4 +1,4 @@
-"""COLMAP's long steps run in a process of their own: what ends or fails there is one error here."""
+"""COLMAP's long steps run in a separate process, and its failure or termination causes one error here."""
 
 import threading
 
@@ -24,7 +24,7 @@ def test_a_process_that_ends_is_an_error_that_names_the_folder(tmp_path, monkeyp
     monkeypatch.setattr(colmap, "WORKER", "pass")
     with colmap_process() as process:
         process.wait()
-        for _ in range(2):  # the second request finds a closed pipe
+        for _ in range(2):  # for the second request, the pipe is closed
             with pytest.raises(InputError, match="exit status 0"):
                 run_colmap("map", tmp_path, text="x" * 100_000)
 
@@ -55,7 +55,7 @@ def test_what_colmap_refuses_is_an_error_with_its_words(tmp_path):
 
 
 def test_a_full_disk_is_one_error(tmp_path):
-    """SQLite or COLMAP may raise or abort: each is an InputError."""
+    """SQLite or COLMAP may raise an exception or abort; each must cause an InputError."""
     (tmp_path / "a.pgm").write_bytes(b"P5 64 64 255\n" + bytes(range(256)) * 16)
     with file_size_limit(4096), pytest.raises(InputError, match="COLMAP"), writing_database(tmp_path):
         run_colmap("extract", tmp_path, names=["a.pgm"], threads=1)
@@ -65,7 +65,7 @@ def test_the_process_ends_when_the_one_that_started_it_does(tmp_path):
     with colmap_process() as process:
         timer = threading.Timer(60, process.kill)
         timer.start()
-        process.stdin.close()  # as when the other end is killed
+        process.stdin.close()  # as if the process at the other end were killed
         assert process.wait() == 0
         timer.cancel()
         process.stdin = None
@@ -74,7 +74,7 @@ def test_the_process_ends_when_the_one_that_started_it_does(tmp_path):
 @pytest.mark.parametrize(("photos", "x", "y", "found"), [(12, 550, 430, True), (12, 470, 420, True),
                                                          (12, 512, 384, False), (6, 550, 430, False)])  # fmt: skip
 def test_principal_points_off_the_middle_are_found_from_ten_photos_on(tmp_path, photos, x, y, found):
-    """COLMAP's synthetic data with noise of half a pixel; cameras start in the middle of 1024 x 768 pixels."""
+    """COLMAP's synthetic data have noise of half a pixel; the initial value is the middle of 1024 x 768 pixels."""
     pycolmap.set_random_seed(1)
     path, out = tmp_path / "x.db", tmp_path / "out"
     out.mkdir()

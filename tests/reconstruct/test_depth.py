@@ -12,7 +12,7 @@ from tests.reconstruct.raycast import arc, photograph
 
 
 def sparse(cameras, truth, step: int = 12) -> SparseModel:
-    """True points on a grid in every view, observed by the views that they project into."""
+    """True points on a grid in every view, observed by the views in which they are visible."""
     points = []
     for i in range(len(cameras)):
         _, world = stereo.unproject(truth[i], cameras.Ks[i], cameras.viewmats[i])
@@ -39,7 +39,7 @@ def test_consistent_depth_is_accurate(block, device):
         consistent = found.support >= 2
         error = ((found.depth - true).abs() / true)[consistent]
         assert consistent.float().mean() > 0.6
-        # a tenth of a pixel between neighbours (12 degrees apart) is 0.25 % of the depth
+        # an error of 0.1 px between neighbours (12 degrees apart) is 0.25 % of the depth
         assert error.median() < 0.0025
         assert (error < 0.02).float().mean() > 0.97
 
@@ -61,13 +61,13 @@ def test_sources_are_the_neighbours(block):
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_better_half_of_the_sources(count, device):
     scores = torch.rand(count, 5, 7, generator=torch.Generator().manual_seed(0)).to(device)
-    scores[:, 0] = 0.5  # equal scores
+    scores[:, 0] = 0.5  # equal scores occur too
     expected = scores.topk((count + 1) // 2, dim=0).values.mean(0)
     torch.testing.assert_close(stereo._mean_of_better_half(list(scores)), expected, rtol=0, atol=1e-6)
 
 
 def test_semi_global_matching_fills_gaps_and_keeps_edges():
-    # Left half at label 3, right half at label 8; in a band of columns all labels have the same cost.
+    # The left half has label 3 and the right half label 8; in a band of columns, all labels have the same cost.
     cost = torch.full((12, 20, 40), 0.6)
     cost[3, :, :20] = 0
     cost[8, :, 20:] = 0

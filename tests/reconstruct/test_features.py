@@ -1,4 +1,4 @@
-"""Features of photos: what happens on a full disk."""
+"""Features of photos on a full disk."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from stages.reconstruct import features
 
 
 def test_a_disk_without_space_for_features_is_one_sentence(monkeypatch):
-    """COLMAP aborts the process where it cannot write, so the space is looked up first."""
+    """COLMAP aborts the process if it cannot write, so the space is checked before."""
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(features.shutil, "disk_usage", lambda folder: SimpleNamespace(free=10_000))
     with pytest.raises(InputError, match="MB free.*TMPDIR"):

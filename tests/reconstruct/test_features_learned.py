@@ -15,7 +15,7 @@ from tests.reconstruct.raycast import arc, photograph
 
 @pytest.fixture
 def published():
-    """Skips without the published weights."""
+    """Skip the test if the published weights are missing."""
     try:
         for file in weights.WEIGHT_FILES.values():
             weights.weight_file(file)
@@ -45,7 +45,7 @@ def test_errors_name_the_package_and_the_matchers(monkeypatch, tmp_path):
 
 
 class IdentityMatcher:
-    """Replaces LightGlue: keypoint k of one photo matches keypoint k of the other."""
+    """Replaces LightGlue; keypoint k of one photo matches keypoint k of the other."""
 
     def to(self, device):
         return self
@@ -75,7 +75,7 @@ def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch, devic
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink, device):
-    """With pixel centres at +0.5, also in photos that are reduced for the network; aliked-n16 is 3 px off."""
+    """Pixel centres are at +0.5, also in photos reduced for the network; aliked-n16 has an error of 3 px."""
     monkeypatch.setattr(features, "MAX_SIDE", 128)
     spots = shrink * torch.tensor([[40.3, 40.0], [80.0, 60.6], [64.0, 96.0], [30.0, 90.2], [100.0, 30.0]])
     at = torch.arange(128.0 * shrink) + 0.5
@@ -88,7 +88,7 @@ def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink, device):
 
 
 def test_keypoints_are_rotation_invariant(published, device):
-    """With aliked-n16 no keypoint is repeated."""
+    """With aliked-n16, no keypoint would be found again."""
     image = as_bytes(photograph(arc(1, (320, 240)), 0)[0])
     network = weights.load_network("aliked").to(device)
     keypoints, _ = features_learned._learned(network, image.numpy(), device)
@@ -98,7 +98,7 @@ def test_keypoints_are_rotation_invariant(published, device):
 
 
 def test_matches_agree_with_true_depth(published, monkeypatch, device):
-    """Views 40 degrees apart: median error below 0.6 px; 1.1 px with aliked-n16."""
+    """For views 40 degrees apart the median error is below 0.6 px; with aliked-n16 it is 1.1 px."""
     monkeypatch.setattr(features_learned, "MAX_FEATURES", 400)
     cameras = arc(2, (320, 240), sweep=40.0)
     (first, depth), (second, _) = (photograph(cameras, i) for i in range(2))

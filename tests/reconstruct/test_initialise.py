@@ -1,4 +1,4 @@
-"""Depth maps to initial Gaussians."""
+"""Conversion of depth maps to initial Gaussians."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.reconstruct.raycast import arc, photograph
 
 
 def flat_cloud(n: int = 400, spacing: float = 0.1) -> OrientedPoints:
-    """A square grid in the plane z = 0."""
+    """A square grid of points in the plane z = 0."""
     side = round(n**0.5)
     grid = spacing * torch.cartesian_prod(torch.arange(side), torch.arange(side)).float()
     points = torch.cat([grid, torch.zeros(n, 1)], 1)
@@ -22,7 +22,7 @@ def flat_cloud(n: int = 400, spacing: float = 0.1) -> OrientedPoints:
 
 @pytest.fixture(scope="module")
 def block():
-    """Three views with their true depth, all of it consistent."""
+    """Three views with their true, consistent depth."""
     cameras = arc(3, (80, 60))
     photos, truth = zip(*(photograph(cameras, i) for i in range(3)), strict=True)
     views = Views(tuple((p * 255).round().to(torch.uint8) for p in photos), cameras)
@@ -55,13 +55,13 @@ def test_unprojected_normals_point_up_on_the_table(block):
 def test_downsampling_reaches_the_target_and_keeps_colours():
     cloud = flat_cloud(10_000, 0.01)
     few = initialise.downsample(cloud, 1000, torch.zeros(3), radius=100.0)
-    assert 250 < len(few) <= 1100  # voxel numbers in a plane change by factors of four
+    assert 250 < len(few) <= 1100  # the number of voxels in a plane changes by factors of four
     torch.testing.assert_close(few.colours, torch.full((len(few), 3), 0.25))
     torch.testing.assert_close(few.points[:, 2], torch.zeros(len(few)))
 
 
 def test_downsampling_is_finer_in_focus():
-    cloud = flat_cloud(10_000, 0.01)  # a square of side 1 from the origin
+    cloud = flat_cloud(10_000, 0.01)  # a square of side 1 with a corner at the origin
     few = initialise.downsample(cloud, 2000, torch.zeros(3), radius=0.6)
     near, far = few.points.norm(dim=1) < 0.2, few.points.norm(dim=1) > 0.8
     before = cloud.points.norm(dim=1)

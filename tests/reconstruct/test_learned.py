@@ -1,4 +1,4 @@
-"""Learned backends: the steps after the network with true geometry in place of its output; complete tiny runs."""
+"""Learned backends: the steps after the network, with true geometry as its output; and complete small runs."""
 
 import dataclasses
 from pathlib import Path
@@ -38,10 +38,10 @@ def small(monkeypatch):
 
 
 def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
-    """A scene from true geometry in an arbitrary frame and unit."""
+    """A scene assembled from true geometry in an arbitrary frame and unit, and the true cameras."""
     cameras = arc(count, SIZE, sweep=70.0)
     photos, geometry = photos_of(cameras, tmp_path), truth(cameras, scale=3.7)
-    if noise:  # smooth, as the errors of networks
+    if noise:  # smooth errors, such as those of networks
         coarse = noise * torch.randn(count, 1, 6, 8, generator=torch.Generator().manual_seed(3))
         factor = 1 + F.interpolate(coarse, geometry.points.shape[1:3], mode="bicubic")[:, 0]
         geometry = dataclasses.replace(geometry, points=geometry.points * factor[..., None])
@@ -52,7 +52,7 @@ def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
 
 
 def to_truth(made, cameras):
-    """Similarity from the scene to the true world, by the camera centres."""
+    """Similarity from the scene to the true world, defined by the camera centres."""
     return umeyama(centres(made.scene.cameras.viewmats), centres(cameras.viewmats))
 
 
@@ -81,9 +81,9 @@ def test_true_geometry_gives_the_true_scene(tmp_path, splats):
     torch.testing.assert_close(back(centres(made.scene.cameras.viewmats)), centres(cameras.viewmats), atol=1e-3, rtol=0)
     torch.testing.assert_close(made.scene.cameras.Ks, cameras.Ks, rtol=2e-3, atol=0.1)
     up = back.rotation @ torch.tensor([0.0, 0, 1])
-    assert up[2] > 0.9998  # a degree
+    assert up[2] > 0.9998  # tilt of at most one degree
     assert abs(float(back(torch.zeros(1, 3))[0, 2])) < 0.01  # the floor is the table
-    assert score_views(made.scene.gaussians, made.views, made.trained)[0] > 17  # the mean colour: 12.6
+    assert score_views(made.scene.gaussians, made.views, made.trained)[0] > 17  # an image of the mean colour has 12.6
 
 
 def test_fit_improves_held_out_views_under_two_percent_noise(tmp_path):
@@ -101,13 +101,13 @@ def test_one_photo_is_enough(tmp_path):
     scale = 1.6 / float(centres(made.scene.cameras.viewmats)[0].norm())
     assert float(centres(made.scene.cameras.viewmats)[0, 2]) * scale == pytest.approx(
         float(centres(cameras.viewmats)[0, 2]), rel=0.1
-    )  # same height above the table
+    )  # the same height above the table
     assert score_views(made.scene.gaussians, made.views, [0])[0] > 17
 
 
 def test_no_floor_without_a_supporting_plane(tmp_path, monkeypatch):
     assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
-    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # no plane is accepted
+    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # rejects all planes
     made, _ = assembled(tmp_path, count=2, iterations=0)
     assert made.scene.floor is None
     assert any("no table or floor" in sentence for sentence in made.advice)
@@ -124,7 +124,7 @@ def test_merged_gaussians_look_like_the_original_ones(tmp_path):
 @pytest.mark.parametrize("name", ["pi3", "pi3-splat"])
 @pytest.mark.parametrize("count", [1, 3])
 def test_complete_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
-    """Random weights give a meaningless scene, but all steps run: photos, weight file, network, scene.ply."""
+    """Random weights give a meaningless scene, but all steps run: reading photos, weights, network, scene.ply."""
     write_set(tmp_path, arc(count, (170, 120)))
     model = random_weights(Pi3(TINY) if name == "pi3" else Pi3Splat(TINY_SPLAT), size=0.05)
     point_head = getattr(model.encoder, "point_head", None) or model.point_head
@@ -138,7 +138,7 @@ def test_complete_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
     assert report.placed == count == len(scene.cameras) and len(scene.gaussians) > 0
     assert scene.gaussians.means.isfinite().all() and scene.floor == 0.0
     assert scene.provenance["options"]["backend"] == name
-    assert scene.cameras.photos.sizes.tolist() == [[170, 120]] * count  # of which the views are the centre
+    assert scene.cameras.photos.sizes.tolist() == [[170, 120]] * count  # the views are their central parts
 
 
 def test_errors_for_missing_weights_and_given_cameras(tmp_path, monkeypatch):
@@ -157,7 +157,7 @@ def test_errors_for_missing_weights_and_given_cameras(tmp_path, monkeypatch):
 
 @torch.no_grad()
 def test_bf16_is_close_to_fp32():
-    """bf16 as on a GPU, run on the CPU."""
+    """Runs the precision that is used on a GPU on the CPU."""
     model = random_weights(Pi3(TINY), size=0.1)
     images = torch.rand(3, 3, 56, 42, generator=torch.Generator().manual_seed(0))
     exact = model(images)

@@ -10,7 +10,7 @@ from tests.conftest import random_gaussians
 
 
 def test_merging_keeps_mean_and_covariance():
-    # two of equal weight at x = 0.1 and 0.3: mean 0.2, variance along x increased by 0.1 squared
+    # Gaussians of equal weight at x = 0.1 and 0.3 have mean 0.2 and a variance along x that is increased by 0.1^2
     two = random_gaussians(2, degree=1)
     same = dataclasses.replace(
         two, means=torch.tensor([[0.1, 0.2, 0.2], [0.3, 0.2, 0.2]]), scales=torch.full((2, 3), 0.05),

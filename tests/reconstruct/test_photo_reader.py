@@ -1,4 +1,4 @@
-"""Folders of photos as users have them, and videos of phones."""
+"""Typical folders of users' photos, and videos of phones."""
 
 import logging
 import struct
@@ -20,7 +20,7 @@ rng = np.random.default_rng(0)
 
 
 def random_image(width: int = 96, height: int = 64) -> np.ndarray:
-    """A random 8-bit RGB image: left half reddish, right half bluish."""
+    """A random 8-bit RGB image whose left half is reddish and right half bluish."""
     small = rng.integers(0, 120, (height // 8, width // 8, 3), dtype=np.uint8)
     pixels = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     pixels[:, : width // 2, 0] |= 128
@@ -70,7 +70,7 @@ def test_grey_photos_become_three_equal_channels(folder):
 def test_exif_rotation_is_applied(folder):
     pixels = random_image()
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be rotated by 90 degrees clockwise
+    exif[0x0112] = 6  # means that the image must be rotated by 90 degrees clockwise
     Image.fromarray(np.ascontiguousarray(np.rot90(pixels))).save(folder / "c.jpg", exif=exif, quality=95)
     photos = read_photos(folder)
     assert photos.size(2) == (96, 64)
@@ -78,7 +78,7 @@ def test_exif_rotation_is_applied(folder):
 
 
 def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
-    pytest.importorskip("pycolmap")  # reads EXIF
+    pytest.importorskip("pycolmap")  # used to read EXIF
     from stages.reconstruct.matching import initial_cameras
 
     exif = Image.Exif()
@@ -88,13 +88,13 @@ def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
     photos = read_photos(folder)
     cameras = initial_cameras(photos)
     assert cameras[0].camera_id == cameras[1].camera_id
-    assert len({c.camera_id for c in cameras}) == 4  # e.jpg has the size of a.jpg, but its focal length is known
+    assert len({c.camera_id for c in cameras}) == 4  # e.jpg has the same size as a.jpg, but a known focal length
     assert cameras[4].has_prior_focal_length and not cameras[0].has_prior_focal_length
     assert cameras[4].mean_focal_length() == pytest.approx(50 / 36 * 96, rel=0.05)
 
 
 def test_large_photos_and_their_focal_lengths_are_reduced(tmp_path):
-    pytest.importorskip("pycolmap")  # reads EXIF
+    pytest.importorskip("pycolmap")  # used to read EXIF
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 36  # the focal length equals the image width
     for name in ("a.jpg", "b.jpg"):
@@ -127,7 +127,7 @@ def test_unreadable_photos_are_named_and_left_out(folder, caplog):
 def test_other_files_with_photo_suffixes_are_left_out(folder, caplog):
     (folder / "folder.jpg").mkdir()
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
-    (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC under another name
+    (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC with the suffix of JPEG
     (folder / "huge.png").write_bytes(png_with_declared_size(60_000, 60_000))
     photos = read_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg")
@@ -136,7 +136,7 @@ def test_other_files_with_photo_suffixes_are_left_out(folder, caplog):
 
 
 def png_with_declared_size(width: int, height: int) -> bytes:
-    """A PNG header without the pixels it declares."""
+    """A PNG header without the pixels that it declares."""
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(b"0"))]
     out = b"\x89PNG\r\n\x1a\n"
     for kind, data in (*chunks, (b"IEND", b"")):
@@ -163,7 +163,7 @@ def test_appended_video_and_thumbnail_do_not_hide_truncation(folder):
     header = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
     (folder / "c.jpg").write_bytes(whole[:2] + header + whole[2:] + b"ftypmp42 a film" * 1000)
     assert len(read_photos(folder)) == 3
-    cut = (whole[:2] + header + whole[2:])[: -len(whole) // 2]  # only the end marker of the thumbnail is left
+    cut = (whole[:2] + header + whole[2:])[: -len(whole) // 2]  # only the end marker of the thumbnail remains
     (folder / "c.jpg").write_bytes(cut)
     assert len(read_photos(folder)) == 2
 
@@ -199,11 +199,11 @@ def test_number_and_size_of_many_photos_are_limited(tmp_path, monkeypatch):
     assert len(photos) == photo_reader.MAX_PHOTOS == 200
     assert all(max(photos.size(i)) == 64 for i in range(200))
     assert set(photos.file_sizes) == {(96, 64)} and photos[[3, 5]].file_size(1) == (96, 64)
-    assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole range
+    assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # photos are from the whole range
 
 
 def write_video(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
-    """A video with frames at these times [s]; the red channel is the time in tenths of a second."""
+    """Write a video with frames at these times [s]; the red channel is the time in tenths of a second."""
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=1000, options={"crf": "10", "g": "10"})
@@ -220,7 +220,7 @@ def write_video(path, times: list[float], size: tuple[int, int] = (96, 64), blur
 
 
 def test_variable_frame_rate_is_sampled_by_time(tmp_path, monkeypatch):
-    # 10 frames/s for 4 s, then 1 frame/s for 16 s: by frame number two thirds would be from the first fifth.
+    # 10 frames/s for 4 s, then 1 frame/s for 16 s: sampled by number, two thirds would be from the first fifth
     monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (10, 10))
     write_video(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
     photos = read_photos(tmp_path / "v.mp4")
@@ -241,9 +241,9 @@ def test_video_rotation_is_applied(tmp_path, matrix, quarter_turns):
     write_video(tmp_path / "v.mp4", [0.1 * i for i in range(3)])
     stored = read_photos(tmp_path / "v.mp4").images
     data = (tmp_path / "v.mp4").read_bytes()
-    a, b, c, d = (65536 * k for k in matrix)  # 16.16 fixed point, for row vectors
+    a, b, c, d = (65536 * k for k in matrix)  # fixed-point numbers (16.16) of a matrix for row vectors
     identity = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
-    at = data.index(identity, data.index(b"tkhd"))  # of the track header, ISO/IEC 14496-12
+    at = data.index(identity, data.index(b"tkhd"))  # position in the track header, ISO/IEC 14496-12
     (tmp_path / "v.mp4").write_bytes(data[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[at + 36 :])
     photos = read_photos(tmp_path / "v.mp4")
     for image, before in zip(photos.images, stored, strict=True):

@@ -1,4 +1,4 @@
-"""Realistic photo sets: cameras are found, or the error says what to change."""
+"""Realistic photo sets: cameras are found, or the error states what to change."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,7 +19,7 @@ from tests.reconstruct.raycast import arc, photograph, rays_of, texture, with_mi
 
 @pytest.fixture(scope="module", autouse=True)
 def one_process() -> Iterator[None]:
-    """COLMAP's process, of which each test would else start one."""
+    """A common COLMAP process for all tests, each of which would otherwise start one."""
     with colmap_process():
         yield
 
@@ -34,7 +34,7 @@ def noisy(image: torch.Tensor, seed: int) -> torch.Tensor:
 
 
 def with_person(image: torch.Tensor, seed: int) -> torch.Tensor:
-    """A fifth of the photo is covered at a random position by something that no other photo shows."""
+    """Cover a fifth of the photo, at a random position, by a pattern that is in no other photo."""
     height, width = image.shape[:2]
     h, w = height // 2, width * 2 // 5
     generator = torch.Generator().manual_seed(seed)
@@ -112,7 +112,7 @@ def test_blank_and_unrelated_photos_are_dropped_with_reason(tmp_path):
 
 
 def test_stationary_camera_is_refused(tmp_path):
-    # As on a turntable before a patterned wall: the matches of the wall do not move.
+    # as on a turntable in front of a patterned wall, whose matches do not move
     true = arc(1, (320, 240))
     still = photograph(true, 0)[0]
     images = [with_person(noisy(still, i), i) for i in range(5)]
@@ -121,7 +121,7 @@ def test_stationary_camera_is_refused(tmp_path):
 
 
 def arc_around(count: int, sweep: float, distance: float = 1.4) -> Cameras:
-    """Cameras on a horizontal arc around the block, about the direction of the x axis."""
+    """Cameras on a horizontal arc around the block, centred at the direction of the x axis."""
     size = torch.tensor((400, 300)).expand(count, 2).clone()
     viewmats = orbit(count, torch.tensor([0.0, 0.0, 0.1]), distance, elevation=30.0, azimuth=-sweep / 2, sweep=sweep)
     return Cameras(viewmats, intrinsics(400, 300, 480.0).expand(count, 3, 3).clone(), size, tuple("abcdefgh"[:count]))
@@ -140,7 +140,7 @@ def test_turntable_before_a_plain_backdrop(tmp_path):
 
 
 def test_mirror_in_the_scene(tmp_path):
-    # A fifth of each photo is a sharp mirror image of the block.
+    # a fifth of each photo is a sharp mirror image of the block
     true = arc_around(6, sweep=75.0)
     model = sfm.estimate_cameras(as_photos([with_mirror(true, i) for i in range(6)], true.names, tmp_path))
     assert model.cameras.names == true.names and max_position_error(model, true) < 0.03
@@ -164,10 +164,10 @@ def test_photos_of_different_objects_are_refused(tmp_path):
 
 
 def test_photos_of_two_places_give_the_larger_set(tmp_path):
-    # As a video with a cut: four photos of one place, three of another.
+    # as in a video with a cut: four photos of one place, three of another
     first, second = arc(4, (320, 240), sweep=40.0), arc(3, (320, 240), sweep=30.0)
     images = [photograph(first, i)[0] for i in range(4)]
-    images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # rotated, negative: no matches
+    images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # rotated negatives, which have no matches
     names = tuple(f"{i}.png" for i in range(7))
     model = sfm.estimate_cameras(as_photos(images, names, tmp_path))
     assert model.cameras.names == names[:4]

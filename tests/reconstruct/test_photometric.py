@@ -23,7 +23,7 @@ def photographed(gaussians: Gaussians, cameras) -> Views:
 @pytest.fixture(scope="module")
 def target() -> tuple[Gaussians, Views]:
     inner = random_gaussians(300, seed=1)
-    gaussians = concatenate([inner, ball((0.0, 0.0, 0.0), 4.0, 500, (0.3, 0.4, 0.5), 0)])  # every pixel is covered
+    gaussians = concatenate([inner, ball((0.0, 0.0, 0.0), 4.0, 500, (0.3, 0.4, 0.5), 0)])  # covers every pixel
     return gaussians, photographed(gaussians, ring(6, 48))
 
 
@@ -37,7 +37,7 @@ def test_wrong_colours_are_corrected(target, device):
 
 
 def test_the_same_seed_gives_the_same_gaussians(target, device):
-    """Bit for bit, with two splits."""
+    """Results are equal to the bit, including two splits."""
     true, views = target
     options = FitOptions(photometric.DENSITY.min_iterations, 2.0, seed=3, device=device)
     first, second = (photometric.fit_gaussians(true[:200], views, options) for _ in range(2))
@@ -54,7 +54,7 @@ def test_the_number_of_threads_changes_nothing(target, with_threads):
 
 
 def test_activations_do_not_depend_on_the_number_of_threads(with_threads):
-    """PyTorch splits tensors of more than 32,768 numbers among its threads."""
+    """PyTorch distributes tensors of more than 32,768 numbers among its threads."""
     fit = photometric._Fit.start(random_gaussians(70_013), 3, 2.0)
     first, *others = (with_threads(n, fit.gaussians) for n in (1, 2, 3, 4))
     for other in others:
@@ -63,7 +63,7 @@ def test_activations_do_not_depend_on_the_number_of_threads(with_threads):
 
 @pytest.mark.gpu
 def test_captured_steps_equal_single_steps(target):
-    """Photos of two sizes, with depths: one CUDA graph each."""
+    """Photos of two sizes, with depths, use two CUDA graphs."""
     true, views = target
     small, wide = photographed(true, ring(3, 48)), photographed(true, ring(3, 64))
     cameras = [torch.cat([getattr(v.cameras, name) for v in (small, wide)]) for name in ("viewmats", "Ks", "sizes")]
@@ -80,7 +80,7 @@ def test_captured_steps_equal_single_steps(target):
 
 
 def test_scores_with_fitted_exposure(target, device):
-    """Photos 0.8 times as bright lose more than 15 dB, which a fitted exposure recovers."""
+    """Photos with 0.8 of the brightness lose more than 15 dB, which a fitted exposure recovers."""
     true, views = target
     dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
     exact, _ = photometric.score_views(true, views, [0, 1], device)
@@ -119,7 +119,7 @@ def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target, d
 
 
 def test_what_is_left_out_of_a_step_is_a_random_share(target, device):
-    """Gaussians that are left out have no gradient; each is left out of some step."""
+    """Omitted Gaussians have no gradient, and each is omitted in some step."""
     true, views = target
     fit = photometric._Fit.start(true.to(device), len(views), 2.0)
     (group,) = photometric._targets(views, (), 2.0, device)
@@ -137,7 +137,7 @@ def test_what_is_left_out_of_a_step_is_a_random_share(target, device):
 
 
 def test_exposure_excludes_parts_linear_in_the_camera_pose():
-    """Brightness linear in the position is view-dependent colour; a single darker photo is not."""
+    """Brightness linear in the position is a view-dependent colour; a single darker photo is exposure."""
     cameras = ring(40, 48)
     projection = photometric._exposure_projection(cameras).double()
     torch.testing.assert_close(projection @ projection, projection)
@@ -160,7 +160,7 @@ def test_invisible_and_transparent_gaussians_are_pruned(device):
     cameras = ring(4, 48)
     views = photographed(true, cameras)
     means = true.means.clone()
-    means[:5] = torch.tensor([0.0, 0, 50.0])  # far above all cameras, in no photo
+    means[:5] = torch.tensor([0.0, 0, 50.0])  # far above all cameras, visible in no photo
     opacities = true.opacities.clone()
     opacities[5:10] = 1e-3
     start = Gaussians(means, true.quats, true.scales, opacities, true.sh, true.object_id)

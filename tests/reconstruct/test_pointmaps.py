@@ -1,4 +1,4 @@
-"""Point maps of a network to cameras and supported depth."""
+"""Conversion of a network's point maps to cameras and supported depth."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_only_true_depth_is_supported():
     depths[3] *= 1.2
     maps = pointmaps.depth_maps(depths, pointmaps.confident_pixels(geometry), found)
     seen = maps[0].support > 0
-    assert maps[0].support[seen].mean() > 2.3  # itself and the two other correct views, where they overlap
+    assert maps[0].support[seen].mean() > 2.3  # itself, and the two other correct views where they overlap
     assert maps[3].support[maps[3].support > 0].mean() < 1.3
     assert (maps[0].support[~pointmaps.confident_pixels(geometry)[0]] == 0).all()
 
@@ -107,7 +107,7 @@ def test_crops_keep_the_image_centre(tmp_path):
 
 
 def test_photo_intrinsics_undo_the_crop(tmp_path):
-    # Of a 100x60 photo (200x120 in the file) at network size 56x56 the view is columns 20 to 80, as is 100 of the file.
+    # A 100x60 photo (200x120 in the file) at network size 56x56 is cropped to columns 20 to 80, centre 100 in the file.
     photos = Photos((torch.zeros(60, 100, 3, dtype=torch.uint8),), ("a",), (0.0,), tmp_path, ((200, 120),))
     K = torch.tensor([[[56.0, 0, 28], [0, 56, 28], [0, 0, 1]]])
     cameras = Cameras(torch.eye(4)[None], K, torch.tensor([[56, 56]]), ("a",))

@@ -21,7 +21,7 @@ from tests.reconstruct.raycast import arc, photograph, write_set
 
 @pytest.fixture(scope="module", autouse=True)
 def one_process() -> Iterator[None]:
-    """COLMAP's process, of which each test would else start one."""
+    """A common COLMAP process for all tests, each of which would otherwise start one."""
     with colmap_process():
         yield
 
@@ -90,7 +90,7 @@ def test_cameras_that_do_not_fit_the_photos_are_refused(tmp_path):
 
 
 def test_known_cameras_work_above_a_table_whose_pattern_repeats(tmp_path, monkeypatch):
-    """Most matches join different tiles, and a geometry fitted to them is wrong."""
+    """Most matches are between different tiles, and geometry fitted to them is wrong."""
     plain = raycast.texture
 
     def tiles(u, v, seed):
@@ -102,19 +102,19 @@ def test_known_cameras_work_above_a_table_whose_pattern_repeats(tmp_path, monkey
     beside = (model.points[:, :2].abs() > 0.3).any(1)
     assert len(model.points) > 100
     assert model.points[beside, 2].abs().median() < 0.01
-    assert (model.points[:, 2] > 0.05).sum() > 20  # of the block, whose texture does not repeat
+    assert (model.points[:, 2] > 0.05).sum() > 20  # points of the block, whose texture does not repeat
 
 
 def test_failure_reason_by_number_of_pairs():
-    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # neighbours only
-    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # such as a checked tablecloth
+    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # only neighbours match
+    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # for example by a checked tablecloth
     assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3)
 
 
 def test_mutual_matches():
     a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
     b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)
-    # the third of a is between two of b, which the ratio test rejects
+    # the third descriptor of a is between two of b, so the ratio test rejects it
     assert features.match_descriptors(a, b).tolist() == [[0, 1], [1, 0]]
 
 
@@ -136,7 +136,7 @@ def test_pairs_of_many_photos_are_neighbours_and_similar_photos(monkeypatch):
     monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)
     found = [torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1) for _ in range(40)]
-    found[39] = found[0]  # a closed loop
+    found[39] = found[0]  # the photos form a closed loop
     chosen = features.select_pairs(found, neighbours=3, similar=2)
     assert (0, 39) in chosen
     assert all((i, i + 1) in chosen for i in range(39))
@@ -153,12 +153,12 @@ def test_number_of_pairs_is_linear_even_if_all_photos_are_similar(monkeypatch):
 
 
 def test_undistortion_straightens_lines(tmp_path):
-    # An edge that k1 = -0.2 bends becomes straight.
+    # an edge distorted by k1 = -0.2 becomes straight
     size, K = (200, 150), torch.tensor([[180.0, 0, 100], [0, 180, 75], [0, 0, 1]])
     y, x = torch.meshgrid(torch.arange(150) + 0.5, torch.arange(200) + 0.5, indexing="ij")
     u, v = (x - 100) / 180, (y - 75) / 180
     du, dv = u.clone(), v.clone()
-    for _ in range(20):  # pinhole coordinates of each distorted pixel
+    for _ in range(20):  # computes undistorted coordinates of each distorted pixel
         r2 = du**2 + dv**2
         du, dv = u / (1 - 0.2 * r2), v / (1 - 0.2 * r2)
     image = (torch.sigmoid((du - 0.3) * 60)[..., None].expand(-1, -1, 3) * 255).to(torch.uint8)

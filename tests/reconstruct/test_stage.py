@@ -1,4 +1,4 @@
-"""Complete reconstructions: photos/ -> scene.ply."""
+"""Complete reconstructions, from photos/ to scene.ply."""
 
 import contextlib
 import dataclasses
@@ -23,9 +23,9 @@ from tests.reconstruct.raycast import BLOCK, arc, photograph, write_set
 
 
 class Run(NamedTuple):
-    """A complete run and what it reported."""
+    """A complete run and its reports."""
 
-    folder: Path  # of the photo set
+    folder: Path  # folder of the photo set
     options: ReconstructOptions
     report: Report
     scene: Scene
@@ -34,7 +34,7 @@ class Run(NamedTuple):
 
 
 def reconstruct_set(folder: Path, cameras: Cameras, preset: dict, **options) -> Run:
-    """Reconstruct a ray-cast set with its true cameras, with a reduced draft preset."""
+    """Reconstruct a ray-cast set with its true cameras, using a reduced draft preset."""
     chosen = ReconstructOptions(cameras=write_set(folder, cameras), quality="draft", **options)
     log, stdout = io.StringIO(), io.StringIO()
     handler, logger = logging.StreamHandler(log), logging.getLogger("stages")
@@ -57,14 +57,14 @@ SMALL = {"gaussians": 2000, "iterations": 5, "iterations_cuda": 5}
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, device) -> Run:
-    """Seven photos, every third held out, with enough iterations to be judged."""
+    """A run with seven photos, every third one held out, with enough iterations for a test of its quality."""
     preset, cameras = {"gaussians": 6000, "iterations": 120, "iterations_cuda": 120}, arc(7, (160, 120), sweep=70.0)
     return reconstruct_set(tmp_path_factory.mktemp("set"), cameras, preset, holdout=3, device=device)
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, device) -> Run:
-    """Four small photos with a scale reference and hardly any iterations."""
+    """A run with four small photos, a scale reference and very few iterations."""
     reference = "photos=photo_00.png,photo_03.png distance=0.25"
     cameras = arc(4, (96, 72), sweep=40.0)
     folder = tmp_path_factory.mktemp("small")
@@ -73,7 +73,7 @@ def small(tmp_path_factory, device) -> Run:
 
 @pytest.fixture
 def small_preset(monkeypatch):
-    """Draft quality with which a run takes seconds."""
+    """Reduce the draft preset so that a run takes seconds."""
     monkeypatch.setitem(QUALITY_PRESETS, "draft", dataclasses.replace(QUALITY_PRESETS["draft"], **SMALL))
 
 
@@ -81,7 +81,7 @@ def test_table_is_horizontal_at_zero(made):
     scene = made.scene
     assert scene.floor == 0.0
     outside = (scene.gaussians.means[:, :2].norm(dim=1) > 0.45) & (scene.gaussians.means[:, :2].norm(dim=1) < 0.9)
-    assert scene.gaussians.means[outside, 2].abs().median() < 0.006  # 1.6 away, matched to a quarter of a pixel
+    assert scene.gaussians.means[outside, 2].abs().median() < 0.006  # at a distance of 1.6, matched to 1/4 of a pixel
 
 
 def test_up_and_floor_agree_with_the_truth(made):
@@ -89,7 +89,7 @@ def test_up_and_floor_agree_with_the_truth(made):
 
     scene = made.scene
     tilt, floor = upright_error(scene.cameras, arc(7, (160, 120), sweep=70.0), scene.floor, 0.0)
-    assert tilt < 0.5 and floor < 0.3  # degrees, % of the scene's size
+    assert tilt < 0.5 and floor < 0.3  # in degrees and % of the scene's size
 
 
 def test_block_has_its_size(made):
@@ -98,7 +98,7 @@ def test_block_has_its_size(made):
     top = ((means[:, 2] - BLOCK[2]).abs() < 0.03) & (means[:, :2].norm(dim=1) < 0.45)
     assert top.sum() > 100
     side = (means[top, :2].quantile(0.95, dim=0) - means[top, :2].quantile(0.05, dim=0)).sort().values
-    # nine tenths of the two sides, rotated about the vertical by any angle
+    # 9/10 of the two sides, at any rotation about the vertical
     assert 0.3 < float(side[0]) < 0.6 and 0.35 < float(side[1]) < 0.7
 
 
@@ -155,7 +155,7 @@ def test_invalid_options(wrong, words):
 
 @pytest.mark.slow
 def test_real_photos_are_all_placed(shared):
-    """The published figure for this set is 11 of 11."""
+    """The published number for this set is also 11 of 11."""
     from stages.reconstruct.photo_reader import read_photos
     from stages.reconstruct.sfm import estimate_cameras
 
@@ -196,7 +196,7 @@ def test_input_error_leaves_no_files(small, small_preset, tmp_path):
 
 
 def test_mixed_formats_sizes_and_unicode_names(small_preset, tmp_path):
-    # Landscape and portrait, large and small, grey, CMYK, rotated by EXIF: photos of three cameras, not given.
+    # landscape and portrait, large and small, grey, CMYK, rotated by EXIF; photos of three unknown cameras
     Image = pytest.importorskip("PIL.Image")
     folder = tmp_path / "Küche 写真 № 1"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""The results of finished steps that an interrupted run leaves."""
+"""Results of finished steps that an interrupted run stores."""
 
 import os
 import pickle
@@ -71,7 +71,7 @@ def test_fingerprints_differ_for_different_photos():
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
 def test_peak_memory_grows_with_an_allocation():
-    child = os.fork()  # its peak begins about where it is, not at that of the tests before
+    child = os.fork()  # its peak begins near its current memory, independent of earlier tests
     if child == 0:
         status = 1
         try:
@@ -88,7 +88,7 @@ def test_peak_memory_grows_with_an_allocation():
 
 
 def test_key_of_a_reconstruction_follows_the_photos_and_the_cameras_file(tmp_path):
-    """A resumed run must not use the results of other photos, or of cameras that were corrected in place."""
+    """A resumed run must not use results of other photos, or of cameras that were changed in the same file."""
     options = ReconstructOptions(cameras=tmp_path / "transforms.json")
     options.cameras.write_text("{}")
     photos = SimpleNamespace(names=("a.png",), focals=[1.0], images=[torch.zeros(2, 2, 3)])

@@ -1,4 +1,4 @@
-"""Synchronisation of films by motion, by sound and as given, and the frames of their release."""
+"""Synchronisation of films by motion, by sound and by given times, and the frames at the release."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -17,15 +17,15 @@ from stages.reconstruct.stage import run
 from stages.reconstruct.synchronise import find_motion, find_offsets, motion_signal, parse_offsets
 from tests.reconstruct.raycast import arc, write_set
 
-SIZE = 64  # of the films [px]
-STARTS = {"a": 8.0, "b": 12.0 + 1 / 3, "c": 6.0 + 2 / 3}  # frame of each film at the release
-FALL, LANDING, REST = 0.35, 12, 24  # px/frame^2, frames after the release: first landing, second landing
+SIZE = 64  # side of the films [px]
+STARTS = {"a": 8.0, "b": 12.0 + 1 / 3, "c": 6.0 + 2 / 3}  # frame of each film at which the object is released
+FALL, LANDING, REST = 0.35, 12, 24  # acceleration [px/frame^2]; frames from the release to the first and second landing
 
 
 def picture(time: float, view: int) -> np.ndarray:
-    """A patterned disc that falls from time 0, rebounds and lands, as a camera sees it (h, w, 3), 0..255."""
+    """Image (h, w, 3), 0..255, of a patterned disc that falls from time 0, rebounds and lands, from one camera."""
     t = min(max(time, 0.0), REST)
-    middle = (LANDING + REST) / 2  # of the rebound, which is half as high
+    middle = (LANDING + REST) / 2  # of the rebound, whose height is half of that of the fall
     height = t**2 if t < LANDING else LANDING**2 / 2 * (1 + ((t - middle) / (REST - middle)) ** 2)
     y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
     cx, cy = 20 + 10 * view, 14 + FALL * height / 2
@@ -47,7 +47,7 @@ def films() -> dict[str, list[np.ndarray]]:
 
 
 def write_frames(folder: Path, films: dict[str, list[np.ndarray]]) -> Path:
-    """The films as folders of frames."""
+    """Write the films as folders of frames."""
     for name, frames in films.items():
         (folder / name).mkdir(parents=True)
         for k, frame in enumerate(frames):
@@ -85,7 +85,7 @@ def test_the_frames_at_the_release_are_the_photos(films, tmp_path):
     assert photos.names == ("a", "b", "c") and sequence.fps == 50
     for name, image, view in zip(photos.names, photos.images, range(3), strict=True):
         assert sequence.starts[name] == pytest.approx(STARTS[name], abs=0.6)
-        assert np.abs(image.numpy() - picture(0, view)).mean() < 4  # before anything moves, but for the noise
+        assert np.abs(image.numpy() - picture(0, view)).mean() < 4  # nothing has moved yet, apart from the noise
     assert REST <= sequence.frames <= REST + 3
 
 
@@ -139,7 +139,7 @@ def test_sequence_options_need_sequence():
 
 
 def write_clap(path: Path, start: float, fps: int = 25, seconds: float = 1.2) -> None:
-    """A video with a short noise at a frame `start`, and silence with hiss otherwise."""
+    """Write a video with a short noise at frame `start` and a quiet hiss otherwise."""
     av = pytest.importorskip("av")
     rate, rng = 48_000, np.random.default_rng(len(path.name))
     sound = 0.002 * rng.standard_normal(int(seconds * rate))
@@ -168,7 +168,7 @@ def test_films_are_synchronised_by_sound(tmp_path):
 
 
 def write_sound(path: Path, codec: str, packet: bytes, late: float = 0.0) -> None:
-    """A film of one frame whose sound is a packet, later than it [s]."""
+    """Write a film of one frame whose sound is one packet that begins later [s]."""
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as file:
         video, audio = file.add_stream("libx264", rate=25), file.add_stream(codec, rate=48_000)
@@ -196,7 +196,7 @@ def test_frames_have_no_sound(tmp_path):
 
 
 def test_the_scene_of_the_release_has_the_times_of_the_films(tmp_path):
-    """Cameras around a still scene; something crosses the pictures from a frame that differs between the films."""
+    """The scene is static; something crosses the image from a frame that differs between the films."""
     pytest.importorskip("pycolmap")
     cameras = write_set(tmp_path / "set", arc(4, (96, 72), sweep=40.0))
     for view, photo in enumerate(sorted((tmp_path / "set/images").iterdir())):
@@ -213,4 +213,4 @@ def test_the_scene_of_the_release_has_the_times_of_the_films(tmp_path):
     scene = read_scene(tmp_path / "scene.ply")
     assert scene.sequence.fps == 50 and len(scene.cameras) == 4
     for view, name in enumerate(scene.cameras.names):
-        assert 8 + view - 0.5 < scene.sequence.starts[name] < 9 + view + 0.5  # the pictures first differ
+        assert 8 + view - 0.5 < scene.sequence.starts[name] < 9 + view + 0.5  # the first frames that differ

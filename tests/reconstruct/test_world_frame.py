@@ -13,7 +13,7 @@ from stages.reconstruct.options import UP_SIDES
 
 
 def tabletop(seed: int = 0) -> torch.Tensor:
-    """A table of half side 0.5 at z = 0 with 1 mm of noise, a box on it, and a floor far below."""
+    """A table of half side 0.5 at z = 0 with noise of 1 mm, a box on it, and a floor far below."""
     generator = torch.Generator().manual_seed(seed)
     rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
     table = rand(4000) * torch.tensor([1.0, 1, 0])
@@ -24,7 +24,7 @@ def tabletop(seed: int = 0) -> torch.Tensor:
 
 
 def one_sided() -> torch.Tensor:
-    """Five cameras on one side, pitched down by 30 degrees, which tilts their mean up as much."""
+    """Five cameras on one side, pitched down by 30 degrees, so that their mean up axis is tilted by as much."""
     return orbit(5, torch.tensor([0.0, 0, 0.1]), 1.0, elevation=30.0, azimuth=10.0, sweep=50.0)
 
 
@@ -33,7 +33,7 @@ def full_ring() -> torch.Tensor:
 
 
 def displaced(points, viewmats, seed: int):
-    """The same scene in an arbitrary frame of half the size, as structure from motion returns it."""
+    """The same scene in an arbitrary frame at half the size, as from structure from motion; and the similarity."""
     generator = torch.Generator().manual_seed(seed)
     R = matrix(torch.randn(4, generator=generator))
     move = Similarity(0.5, R, torch.randn(3, generator=generator))
@@ -55,7 +55,7 @@ def test_table_is_horizontal_at_zero(cameras, seed):
 
 
 def test_textured_objects_do_not_tilt_the_plane():
-    # A keyboard and a book, 15 and 35 mm high, with ten times as many points as the table under them.
+    # A keyboard and a book, 15 and 35 mm high, have ten times as many points as the table under them.
     generator = torch.Generator().manual_seed(0)
     rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
     table = rand(900) * torch.tensor([1.2, 0.8, 0.0])
@@ -81,7 +81,7 @@ def test_up_is_found_in_turned_photos(cameras, side):
 
 
 def test_a_table_and_a_wall_of_like_size_are_told_apart_by_the_given_side():
-    """Photos from one side of a corner: the table lies below the cameras, and for turned photos the wall does."""
+    """In photos from one side of a corner the table is below the cameras, in rotated ones the wall is."""
     generator = torch.Generator().manual_seed(0)
     table = torch.rand(3000, 3, generator=generator) * torch.tensor([2.0, 2, 0]) - torch.tensor([1.0, 1, 0])
     wall = torch.rand(3000, 3, generator=generator) * torch.tensor([0.0, 2, 2]) - torch.tensor([1.0, 1, 0])
@@ -113,7 +113,7 @@ def test_scale_of_given_cameras_is_kept():
 
 
 def test_wall_is_not_a_floor():
-    # An object on a wall and horizontal cameras: no floor, and up is that of the cameras.
+    # For an object on a wall and horizontal cameras there is no floor, and up is the up axis of the cameras.
     generator = torch.Generator().manual_seed(0)
     wall = torch.rand(5000, 3, generator=generator) * torch.tensor([2.0, 0, 2]) + torch.tensor([-1.0, 1, -1])
     bump = 0.2 * torch.randn(2000, 3, generator=generator)

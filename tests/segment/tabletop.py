@@ -1,4 +1,4 @@
-"""Tabletop scenes with known labels: shapes made of Gaussians on a plane, with cameras all around."""
+"""Tabletop scenes with known labels: shapes of Gaussians on a plane, with cameras on a circle around them."""
 
 import torch
 
@@ -25,7 +25,7 @@ def coloured_gaussians(surface: Surface, rgb: tuple, object_id: int, grain: floa
 
 
 def visible_from_above(surface: Surface) -> Surface:
-    """The part of a surface that a reconstruction contains: not its bottom."""
+    """The part of a surface that a reconstruction contains, which excludes its bottom."""
     return surface.kept((surface.normals[:, 2] > -0.5) & (surface.points[:, 2] > 0))
 
 
@@ -42,7 +42,7 @@ def egg(centre: tuple, radii: tuple, rgb: tuple, object_id: int, n: int = 1500) 
 
 
 def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: bool = True) -> Scene:
-    """A scene of all parts, with noise [m] on the positions and z sheared by `tilt` along x."""
+    """A scene of all parts with noise [m] of the positions, in which z is sheared by `tilt` along x."""
     g = concatenate(parts)
     rng = torch.Generator().manual_seed(1)
     means = g.means + noise * torch.randn(len(g), 3, generator=rng)
@@ -52,7 +52,7 @@ def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: 
 
 
 def three_apart(side: float = 1.2, **how) -> Scene:
-    """A red block, a blue egg, a green tower, apart on a table; the time of networks is that of the table's voxels."""
+    """A red block, a blue egg and a green tower, separate on a table; a smaller table reduces the time of networks."""
     return scene_of(
         table_gaussians(side=side), block((-0.2, -0.1), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.2, -0.1, 0.07), (0.06, 0.06, 0.07), (0.1, 0.2, 0.8), 2),
@@ -61,7 +61,7 @@ def three_apart(side: float = 1.2, **how) -> Scene:
 
 
 def best_overlap(found: torch.Tensor, truth: torch.Tensor) -> dict[int, float]:
-    """For each true object the IoU of the found object that fits it best."""
+    """For each true object, the largest IoU with a found object."""
     out = {}
     for t in truth.unique().tolist():
         if t > 0:

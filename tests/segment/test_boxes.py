@@ -19,11 +19,11 @@ from stages.segment.prompts import read_prompts
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart
 
-NOTHING = np.zeros((8, 16), np.int64)  # labels of a view
+NOTHING = np.zeros((8, 16), np.int64)  # empty labels of a view
 
 
 def prompts_of(path, scene, numbers, grow=1.0):
-    """A file with a box around each of these objects in the first view."""
+    """Write a file with a box around each of these objects in the first view, and return options that use it."""
     rows = []
     for i in numbers:
         pixel = project(scene.gaussians.means[scene.gaussians.object_id == i], scene.cameras.viewmats[0],
@@ -43,12 +43,12 @@ def overlap(found, scene, mine, theirs):
 
 
 def test_object_leaning_on_background_is_segmented(tmp_path):
-    """A green doll of two eggs sits against a white cushion without a box."""
+    """A green doll of two eggs leans on a white cushion that has no box."""
     cushion = block((0.0, 0.16), (0.4, 0.12, 0.25), (0.85, 0.85, 0.8), 2)
     trunk = egg((0.0, 0.03, 0.08), (0.07, 0.07, 0.08), (0.15, 0.6, 0.1), 1)
     head = egg((0.0, 0.03, 0.2), (0.05, 0.05, 0.05), (0.15, 0.65, 0.15), 1)
     scene = scene_of(table_gaussians(), cushion, trunk, head, noise=0.001)
-    scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 4, 0]])  # the doll shows in the first
+    scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 4, 0]])  # the doll is visible in the first view
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
     assert [(o.id, o.name) for o in found.objects] == [(1, "thing 1")]
     assert overlap(found, scene, 1, 1) > 0.85
@@ -63,7 +63,7 @@ def test_overlapping_boxes_are_separated(tmp_path):
 
 
 def test_object_of_the_background_colour_is_reported_as_missing(tmp_path, caplog):
-    """A block of the colour of the table."""
+    """A block with the colour of the table."""
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
     assert found.objects == () and "won no Gaussian" in caplog.text
@@ -84,17 +84,17 @@ def test_box_of_the_whole_image_labels_all_of_it():
 
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
 def test_where_boxes_overlap_the_smaller_is_on_top(order, monkeypatch):
-    """Each object fills its box."""
+    """The replaced segmentation fills each box with its object."""
     monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, likely, sure, seed: unlikely | likely)
     picture = np.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=np.uint8)
-    wide, tall = [0.0, 0.0, 1.0, 0.5], [0.6, 0.0, 1.0, 1.0]  # areas of .5 and .4
+    wide, tall = [0.0, 0.0, 1.0, 0.5], [0.6, 0.0, 1.0, 1.0]  # areas of 0.5 and 0.4
     labels = segment_prompted_view(picture, torch.tensor([[wide, tall][i] for i in order]), 0)
     assert (labels[:, 24:] == order.index(1) + 1).all() and (labels[:20, :24] == order.index(0) + 1).all()
 
 
 @pytest.mark.parametrize("turns", range(4))
 def test_what_continues_beside_a_box_on_any_side_is_not_likely(turns, monkeypatch):
-    """A stripe of the background runs into the box from one side, past an object of another colour."""
+    """A stripe of the background extends into the box from one side, beside an object of a different colour."""
     likely = []
     monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, mask, *_: likely.append(mask) or mask)
     picture = np.full((80, 80, 3), 40, np.uint8)
@@ -106,7 +106,7 @@ def test_what_continues_beside_a_box_on_any_side_is_not_likely(turns, monkeypatc
 
 
 def test_boxes_are_in_pixels_of_the_first_view(tmp_path, monkeypatch):
-    """The other views have other sizes."""
+    """The other views have different sizes."""
     cameras = orbit_cameras(2)
     cameras = replace(cameras, sizes=torch.tensor([[160, 80], [40, 30]]))
     (tmp_path / "p.json").write_text('{"bbox": [[16, 8, 80, 40]]}')
@@ -119,7 +119,7 @@ def test_boxes_are_in_pixels_of_the_first_view(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_another_view_starts_from_the_labels_of_its_front_most_gaussians(first, monkeypatch):
-    """Of two, one of the object and one of the background; the sky has none."""
+    """One of the two Gaussians is of the object and one of the background; the sky has none."""
     monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, likely, sure, seed: sure)
     front = torch.full((30, 40), -1, dtype=torch.int32)
     front[10:, :20], front[10:, 20:] = first, 1 - first
@@ -174,7 +174,7 @@ def test_scene_without_cameras_is_refused(tmp_path, backend, cameras):
 
 
 def test_ratio_of_colours_is_that_of_their_frequencies():
-    """A red half and a blue one: frequencies count, not numbers of pixels."""
+    """For a red and a blue half: frequencies of colours count, not numbers of pixels."""
     image = np.zeros((40, 80, 3), np.uint8)
     image[:, :40, 0], image[:, 40:, 2] = 255, 255
     inside, around = np.zeros((2, 40, 80), bool)

@@ -1,4 +1,4 @@
-"""Discovery of objects without prompts, with mask proposals made from true labels in place of a network."""
+"""Discovery of objects without prompts; mask proposals are computed from true labels instead of by a network."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ from stages.segment.options import SegmentOptions
 from stages.segment.view_images import ViewImages, view_images
 from tests.segment.tabletop import best_overlap, three_apart
 
-SIDE = 64  # of the proposed masks [px]
+SIDE = 64  # side of the proposed masks [px]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def visible_objects(scene: Scene, view: int) -> torch.Tensor:
 
 
 def downsample(image: torch.Tensor) -> torch.Tensor:
-    """Labels 0 to 3 at SIDE x SIDE pixels."""
+    """Reduce labels 0 to 3 to SIDE x SIDE pixels."""
     masks = torch.stack([image == i for i in range(4)]).float()
     small = torch.nn.functional.interpolate(masks[None], (SIDE, SIDE), mode="area")[0] > 0.5
     return small.float().argmax(0)
@@ -54,7 +54,7 @@ class OracleTracker:
     max_distance: int = 100
 
     def proposals(self, row: int) -> torch.Tensor:
-        """Every object, the upper half of each, the table, the whole image, and a small piece of table."""
+        """All objects, the upper half of each, the table, the whole image, and a small piece of the table."""
         ids = downsample(self.label_images[row])
         whole = [ids == i for i in range(4)]
         upper = torch.arange(SIDE)[:, None] < SIDE // 2
@@ -91,7 +91,7 @@ def test_only_masks_of_whole_objects_on_the_table_are_kept(oracle, truth, suppor
 
 
 def test_lost_object_is_found_again_under_its_number(oracle, truth, support):
-    oracle.max_distance = 2  # so that each searched photo proposes all three objects again
+    oracle.max_distance = 2  # each searched photo then proposes all three objects again
     found = discover_objects(oracle, support, SegmentOptions())
     assert max(int(labels.max()) for labels in found.values()) == 3
     assert min(overlaps(truth, found).values()) > 0.9
@@ -119,10 +119,10 @@ def test_is_on_support(truth, support):
         assert is_on_support(truth, torch.nonzero(ids == i)[:, 0], support, SegmentOptions())
         assert is_on_support(truth, torch.nonzero(ids == i)[:, 0], None, SegmentOptions())
     assert not is_on_support(truth, torch.nonzero(ids == 0)[:, 0], support, SegmentOptions())  # the table
-    assert not is_on_support(truth, torch.nonzero(ids == 1)[:5, 0], support, SegmentOptions())  # a few pixels
+    assert not is_on_support(truth, torch.nonzero(ids == 1)[:5, 0], support, SegmentOptions())  # too few pixels
     assert not is_on_support(truth, torch.nonzero(ids == 1)[:, 0], support, SegmentOptions(min_size=0.5))
     assert not is_on_support(truth, torch.full((100,), -1), support, SegmentOptions())  # empty pixels
-    for distance, near in ((0.75, True), (0.85, False)):  # without a table, within .8 of the cameras' distance
+    for distance, near in ((0.75, True), (0.85, False)):  # without a table, the limit is 0.8 of the cameras' distance
         moved = replace(truth.gaussians, means=truth.gaussians.means.clone())
         rows = torch.nonzero(ids == 1)[:, 0]
         side = moved.means[rows] - moved.means[rows].median(0).values
@@ -135,16 +135,16 @@ def test_is_on_support(truth, support):
 
 def test_masks_inside_larger_ones_are_removed():
     masks = torch.zeros(4, 1, 20, dtype=torch.bool)
-    masks[0, 0, :3] = True  # inside the next
+    masks[0, 0, :3] = True  # inside the next mask
     masks[1, 0, :10] = True
-    masks[2, 0, 8:12] = True  # half inside it
-    masks[3, 0, 8:13] = True  # two fifths, and the one above lies inside this one
+    masks[2, 0, 8:12] = True  # half of it is inside the second mask
+    masks[3, 0, 8:13] = True  # 2/5 of it are inside the second mask, and the third one is inside this one
     assert torch.equal(remove_nested_masks(masks), masks[[1, 3]])
     assert remove_nested_masks(masks[:0]).shape == (0, 1, 20)
 
 
 def test_masks_of_one_size_keep_their_order():
-    """Sorting is not stable by itself: with hundreds of values it depends on the processor."""
+    """Sorting is not stable by default; for hundreds of values, its order depends on the processor."""
     masks = torch.eye(300, dtype=torch.bool).flip(0)[:, None]
     assert torch.equal(remove_nested_masks(masks), masks)
 
@@ -152,14 +152,14 @@ def test_masks_of_one_size_keep_their_order():
 def test_numbers_of_new_labels():
     old = {0: torch.tensor([[1, 1, 2, 2, 0, 0]]), 1: torch.tensor([[0, 0, 0, 0, 0, 0]])}
     fresh = {0: torch.tensor([[2, 2, 0, 0, 1, 1]]), 1: torch.tensor([[2, 2, 2, 2, 2, 3]])}
-    # the second covers object 1 in the one photo that shows both; the others are new
+    # the second label covers object 1 in the only photo that contains both; the others are new
     assert match_labels(fresh, old, new=3, count=2).tolist() == [0, 3, 1, 4]
     assert match_labels(fresh, {}, new=3, count=0).tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(("covered", "known"), [(3, True), (2, False), (1, False)])
 def test_a_label_is_an_object_of_which_it_covers_more_than_half(covered, known):
-    """Of four pixels; in a view in which the object is not seen nothing is compared."""
+    """The object has four pixels; views in which the object is not visible are ignored."""
     labels = torch.ones(2, 2, dtype=torch.int64)
     old = torch.zeros(4, dtype=torch.int64)
     old[:covered] = 2

@@ -25,7 +25,7 @@ LENS = [-0.25, 0.0, 0.0, 0.0, 0.0]
 
 @pytest.fixture(scope="module")
 def truth():
-    """Three objects seen from close by, near the borders of the images."""
+    """Three objects at a short distance, near the borders of the images."""
     scene = scene_of(
         table_gaussians(), block((-0.25, -0.15), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.25, -0.15, 0.07), (0.06, 0.06, 0.07), (0.1, 0.2, 0.8), 2),
@@ -52,7 +52,7 @@ def without_lens(scene):
 
 
 def photographed(scene, view: int, draw) -> torch.Tensor:
-    """The image that `draw(viewmat, K, side)` renders, through the lens of the photo, nearest neighbour."""
+    """The image rendered by `draw(viewmat, K, side)`, distorted by the lens of the photo, by nearest neighbour."""
     K = scene.cameras.photos.Ks[view].double().numpy()
     at = np.stack(np.meshgrid(*[np.arange(PHOTO_SIDE) + 0.5] * 2), -1).reshape(-1, 2)
     rays = (at - K[:2, 2]) / K[[0, 1], [0, 1]]
@@ -127,7 +127,7 @@ def test_boxes_in_pixels_of_the_photo(truth, tmp_path):
 
 
 def test_opencv_bends_the_same_way():
-    """The closed form above is OpenCV's k1."""
+    """The formula used above is that of k1 in OpenCV."""
     x = np.array([[0.3, -0.4, 1.0]])
     pixel, _ = cv2.projectPoints(x, np.zeros(3), np.zeros(3), np.eye(3), np.array(LENS))
     np.testing.assert_allclose(pixel[0, 0], x[0, :2] * (1 + LENS[0] * 0.25))

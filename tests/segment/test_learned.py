@@ -1,4 +1,4 @@
-"""The learned backend with the weights in the package."""
+"""The learned backend with the weights that the package contains."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.segment.tabletop import best_overlap, egg, scene_of, table_gaussians,
 
 
 def without_labels(scene: Scene) -> Scene:
-    """The scene with all Gaussians in the background."""
+    """The scene with all Gaussians labelled as background."""
     return replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
 
 
@@ -27,7 +27,7 @@ def test_objects_apart_on_a_table_are_found():
 
 @pytest.mark.slow
 def test_an_object_that_fills_the_photos_is_one():
-    """It is .8 high, with cameras at a distance of one unit."""
+    """The object has a height of 0.8; cameras are at a distance of one unit."""
     r = 0.4
     body = [egg((0, 0, r), (0.5 * r, 0.4 * r, r), (0.8, 0.1, 0.1), 1, 3000),
             egg((0.5 * r, 0, 1.2 * r), (0.5 * r, 0.2 * r, 0.2 * r), (0.8, 0.1, 0.1), 1)]  # fmt: skip

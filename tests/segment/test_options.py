@@ -1,4 +1,4 @@
-"""Options of `ngff segment`: the limits of their values, and which exclude each other."""
+"""Options of `ngff segment`: limits of values, and options that exclude each other."""
 
 from functools import partial
 from pathlib import Path

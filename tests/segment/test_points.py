@@ -1,4 +1,4 @@
-"""Objects at points that the user gives."""
+"""Objects at points given by the user."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def unlabelled(scene: Scene) -> Scene:
 
 
 def at(scene: Scene, number: int, view: int, name: str) -> str:
-    """The text of a point at the top of an object, in a view."""
+    """Option text of a point at the top of an object in a view."""
     means = scene.gaussians.means[scene.gaussians.object_id == number]
     top = torch.cat([means[:, :2].mean(0), means[:, 2].max()[None]])
     x, y = project(top[None], scene.cameras.viewmats[view], scene.cameras.Ks[view])[0].tolist()
@@ -30,7 +30,7 @@ def at(scene: Scene, number: int, view: int, name: str) -> str:
 
 
 def test_the_objects_at_the_points_are_found_with_their_names(device, monkeypatch):
-    monkeypatch.setattr(clicks, "SCALES", SCALES[:2])  # of three, each of which takes a second
+    monkeypatch.setattr(clicks, "SCALES", SCALES[:2])  # two of three, each of which takes a second
     scene = three_apart(side=0.56)
     points = at(scene, 3, 0, "green tower"), at(scene, 1, 4, "brick")
     found = segment(unlabelled(scene), SegmentOptions(points=points, device=device))
@@ -60,11 +60,11 @@ def test_outlines_are_cut_in_views_that_are_drawn_on_the_device(device, monkeypa
     scene = three_apart(side=0.56)
     found = segment(unlabelled(scene), SegmentOptions(points=(at(scene, 2, 0, "egg"),), device=device))
     assert asked == [device] and set(drawn) == {device}
-    assert found.gaussians.object_id.device.type == "cpu"  # as all of the scene
+    assert found.gaussians.object_id.device.type == "cpu"  # as in the whole scene
 
 
 def test_points_of_one_name_are_on_one_object(monkeypatch):
-    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # of three, each of which takes a second
+    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # one of three, each of which takes a second
     scene = three_apart(side=0.56)
     points = at(scene, 2, 0, "egg"), at(scene, 2, 5, "egg")
     found = segment(unlabelled(scene), SegmentOptions(points=points))
@@ -73,9 +73,9 @@ def test_points_of_one_name_are_on_one_object(monkeypatch):
 
 
 def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog, monkeypatch):
-    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # of three, each of which takes a second
+    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # one of three, each of which takes a second
     scene = three_apart(side=0.56)
-    corner = torch.tensor([[-0.26, 0.26, 0.0]])  # of the table
+    corner = torch.tensor([[-0.26, 0.26, 0.0]])  # a corner of the table
     x, y = project(corner, scene.cameras.viewmats[0], scene.cameras.Ks[0])[0].tolist()
     nothing = f"xy={x:.0f},{y:.0f}"
     found = segment(unlabelled(scene), SegmentOptions(points=(nothing, at(scene, 2, 0, "egg"))))

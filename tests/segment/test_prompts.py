@@ -1,4 +1,4 @@
-"""What users give to `ngff segment`: prompts.json, names of labels, folders of images, measured lengths."""
+"""User inputs of `ngff segment`: prompts.json, names of labels, folders of images, measured lengths."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def prompts_file(folder, **data) -> Path:
 
 def test_rows_of_prompts_and_their_names(tmp_path):
     cameras = ring(count=2)
-    one = read_prompts(prompts_file(tmp_path, bbox=[1, 2, 3, 4]), cameras)  # without its outer brackets
+    one = read_prompts(prompts_file(tmp_path, bbox=[1, 2, 3, 4]), cameras)  # the outer brackets may be omitted
     assert one.boxes.tolist() == [[1, 2, 3, 4]] and one.points is None and one.names == ("object_1",)
     two = read_prompts(prompts_file(tmp_path, center_point=[[5, 6], [7, 8]], text=["a", "b"]), cameras)
     assert two.boxes is None and two.points.tolist() == [[5, 6], [7, 8]] and two.names == ("a", "b")
@@ -50,7 +50,7 @@ def test_other_prompts_are_refused(tmp_path, data, message):
 
 
 def test_points_where_the_lens_shows_nothing_are_refused(tmp_path):
-    """r (1 - r^2 / 4) is 0.77 at most: no direction is seen at the corners of a wide photo."""
+    """r (1 - r^2 / 4) is at most 0.77, so no direction is seen in the corners of a wide photo."""
     cameras = ring(count=1)
     K = torch.tensor([[[30.0, 0, 32], [0, 30, 32], [0, 0, 1]]])
     barrel = PhotoIntrinsics(K, cameras.sizes, torch.tensor([[-0.25, 0, 0, 0, 0]]))
@@ -130,7 +130,8 @@ def test_views_are_rendered_at_limited_size(two_balls, monkeypatch):
 
 def test_the_first_view_comes_first_and_of_many_some_are_taken(two_balls):
     order = nearest_first(two_balls)
-    assert [min(i, 6 - i) for i in order] == [0, 1, 1, 2, 2, 3] and len(set(order)) == 6  # around a ring of six
+    # the order around a ring of six
+    assert [min(i, 6 - i) for i in order] == [0, 1, 1, 2, 2, 3] and len(set(order)) == 6
     many = replace(two_balls, cameras=ring(count=100))
     views = nearest_first(many)
     assert len(set(views)) == MAX_VIEWS == len(views) and views[0] == 0 and abs(views[-1] - 50) <= 1
@@ -159,7 +160,7 @@ def test_measured_lengths(text, result):
 
 @pytest.mark.parametrize(("side", "units"), [("height", 0.3), ("length", 0.6)])
 def test_a_measured_length_gives_the_scale(two_balls, side, units):
-    """Of an object of .6 x .2 x .3, without two outliers in a thousand."""
+    """The object has the size 0.6 x 0.2 x 0.3, without two outliers among 1000 points."""
     x = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.6, 0.2, 0.3])
     x[:2] = 50.0
     g = two_balls.gaussians

@@ -1,4 +1,4 @@
-"""The sam2 backend with a tiny random network, through the loader of the published one."""
+"""The sam2 backend with a tiny random network, read by the loader of the published one."""
 
 import json
 from functools import partial
@@ -54,7 +54,7 @@ def test_prompts_give_named_objects(scene_file, truth, weights, photos, tmp_path
     run(scene_file, tmp_path / "out.ply", SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights))
     labelled = read_scene(tmp_path / "out.ply")
     names = prompts.get("text", ["object_1", "object_2"])
-    assert labelled.objects or device == "cuda"  # in bfloat16 random masks may win no Gaussian
+    assert labelled.objects or device == "cuda"  # in bfloat16, random masks may not win any Gaussian
     assert all(o.name == names[o.id - 1] for o in labelled.objects)
     assert set(labelled.gaussians.object_id.unique().tolist()) == {0, *(o.id for o in labelled.objects)}
     inputs = [row["name"] for row in labelled.provenance["inputs"]]
@@ -62,7 +62,7 @@ def test_prompts_give_named_objects(scene_file, truth, weights, photos, tmp_path
 
 
 def test_rendered_views_equal_their_photos(truth, photos):
-    """Up to the rounding of PNG to 8 bits."""
+    """They are equal up to the rounding of PNG to 8 bits."""
     shown, read = view_images(truth), view_images(truth, photos)
     assert shown.views == read.views == list(range(len(truth.cameras)))
     torch.testing.assert_close(shown.image(3), read.image(3), rtol=0, atol=0.51 / 255)

@@ -1,4 +1,4 @@
-"""The segment stage: geometric and masks backends, voting, messages."""
+"""The segment stage: geometric and masks backends, voting, and messages."""
 
 import json
 import logging
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("device")
 
 
 def true_masks(scene):
-    """A label image for each camera: the object that each pixel shows."""
+    """A label image for each camera, with the object that each pixel shows."""
     masks = []
     for viewmat, K, size in zip(scene.cameras.viewmats, scene.cameras.Ks, scene.cameras.sizes, strict=True):
         index = visibility(scene.gaussians, viewmat, K, *size.tolist()).index
@@ -80,10 +80,10 @@ def test_scale_reference_sets_metres_per_unit(scene_file, truth, tmp_path, side,
 def test_wrong_pixels_of_masks_are_outvoted(scene_file, truth, tmp_path):
     rng = torch.Generator().manual_seed(0)
     masks = true_masks(truth)
-    for mask in masks:  # a tenth of all pixels are random
+    for mask in masks:  # 10 % of the pixels are random
         wrong = torch.rand(mask.shape, generator=rng) < 0.1
         mask[wrong] = torch.randint(0, 4, (int(wrong.sum()),), generator=rng)
-    masks[2] = masks[2].roll(25, 1)  # and one photo is off altogether
+    masks[2] = masks[2].roll(25, 1)  # and one image is shifted
     folder = write_masks(tmp_path / "masks", truth, masks)
     (folder / "names.json").write_text(json.dumps({"1": "duck", "3": "tower"}))
     run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
@@ -128,14 +128,14 @@ def test_labels_of_names_are_plain_numbers_each_once(tmp_path, names):
 
 
 def test_names_of_labelled_photos_are_read_too(tmp_path):
-    """The names.json of `ngff evaluate --against LABELS/` has more than names."""
+    """The names.json for `ngff evaluate --against LABELS/` contains further fields."""
     (tmp_path / "names.json").write_text(json.dumps({"1": {"name": "duck", "core": True}, "4": "tower"}))
     assert read_names(tmp_path) == {1: "duck", 4: "tower"}
 
 
 def test_permuted_labels_of_one_mask_are_outvoted(scene_file, truth, tmp_path):
     masks = true_masks(truth)
-    masks[3] = torch.tensor([0, 2, 3, 1])[masks[3]]  # a tool that numbered one photo in another order
+    masks[3] = torch.tensor([0, 2, 3, 1])[masks[3]]  # one image is numbered in a different order
     some = [1, 3, 5, 6, 7]
     folder = write_masks(tmp_path / "masks", replace(truth, cameras=truth.cameras[some]), [masks[i] for i in some])
     run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
@@ -167,8 +167,8 @@ def test_non_finite_gaussians_stay_background(truth):
 
 def test_one_close_view_does_not_outvote_two_distant_ones():
     near, far = torch.tensor([[0.0, 90.0, 0.0]]), torch.tensor([[0.0, 0.0, 30.0]])
-    assert int((near + 2 * far).argmax(1)) == 1  # by pixels it would
-    assert int((damp_votes(near) + 2 * damp_votes(far)).argmax(1)) == 2  # 9.5 against 11.0
+    assert int((near + 2 * far).argmax(1)) == 1  # the sums of pixels would give this label
+    assert int((damp_votes(near) + 2 * damp_votes(far)).argmax(1)) == 2  # votes of 9.5 and 11.0
     torch.testing.assert_close(damp_votes(torch.tensor([[1.0, 3.0]])), torch.tensor([[0.5, 1.5]]))
     assert damp_votes(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
 
@@ -181,11 +181,11 @@ def test_votes_are_pooled_among_close_neighbours():
     out = pool_votes(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1), votes)
     assert out[4].tolist() == [8.0, 3.0] and out[13].tolist() == [0.0, 9.0]
     alone = pool_votes(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1)[:10], votes[:10])
-    assert alone[9].tolist() == [0.0, 1.0]  # its nearest are far away
+    assert alone[9].tolist() == [0.0, 1.0]  # its nearest neighbours are too far away
 
 
 def test_outliers_by_the_modified_z_score():
-    # distances 1, 2, 3, 4, 100 from the median: median 3, MAD 1, so 0.6745 * 97 > 3.5 and 0.6745 * 2 is not
+    # distances from the median are 1, 2, 3, 4, 100; median 3 and MAD 1, so 0.6745 * 97 > 3.5 but 0.6745 * 1 is not
     x = torch.tensor([0.0, -1, 1, -2, 2, -3, 3, -4, 4, 100])
     means = torch.stack([x, torch.zeros(10), torch.zeros(10)], 1)
     ids = remove_outliers(means, torch.ones(10, dtype=torch.int64))
@@ -264,7 +264,7 @@ def test_empty_table_has_no_objects(truth, tmp_path, caplog):
 
 
 def test_votes_of_pixels_and_of_centres_on_the_surface():
-    """Gaussian 0 is in front in one pixel; 1 and 2 lie on the surface, with weights of 2 and 0."""
+    """Gaussian 0 is in front in one pixel; Gaussians 1 and 2 lie on the surface with weights of 2 and 0."""
     front = torch.tensor([[0, -1], [-1, -1]])
     on, pixels, weights = torch.tensor([1, 2]), torch.tensor([3, 3]), torch.tensor([2.0, 0.0])
     footprint = ViewFootprint(front, on, pixels, weights, 4, torch.zeros(2, 2, 3))

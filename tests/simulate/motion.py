@@ -1,4 +1,4 @@
-"""Motions of scenes in memory: what an engine derives from a scene is computed once for all tests that share it."""
+"""Motions of scenes in memory; data that an engine computes from a scene are cached for all tests that use it."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from stages.simulate.options import ENGINES, SimulateOptions
 
 @dataclass(frozen=True)
 class Motion:
-    """Frames of a rollout, in scene units; names as in `Trajectory`."""
+    """Frames of a rollout in scene units; fields are named as in `Trajectory`."""
 
     keypoints: Keypoints
     positions: Float[Tensor, "t k 3"]
@@ -26,7 +26,7 @@ class Motion:
 
 
 def roll_out(scene: Scene, options: SimulateOptions) -> Motion:
-    """The motion that `ngff simulate` would write of a labelled scene, with an engine named in the options."""
+    """The motion of a labelled scene that `ngff simulate` would write, with the engine given in the options."""
     keypoints = choose_keypoints(scene, options.keypoint_count, options.seed)
     prompts = forces.parse(scene.objects, options.force, options.pin, options.velocity, options.lift)
     rollout = load(ENGINES[options.engine].rollout)

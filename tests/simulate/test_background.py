@@ -1,4 +1,4 @@
-"""Fixed boxes from the background of a scene."""
+"""Fixed boxes that represent the background of a scene."""
 
 import math
 from dataclasses import replace
@@ -30,10 +30,10 @@ def test_a_wall_becomes_boxes_but_neither_the_table_nor_what_adjoins_an_object()
     scene = Scene(concatenate(gaussians), (SceneObject(1, "cube"),), None, 0.0)
     boxes = np.array(background_boxes(scene, 0.0))
     low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
-    assert 0.13 < low[0] < 0.141 and 0.159 < high[0] < 0.17  # the piece at -.102 adjoins the cube
+    assert 0.13 < low[0] < 0.141 and 0.159 < high[0] < 0.17  # the piece at -0.102 touches the cube
     shift = np.array([4.0, -3.0, 2.0])
     moved = replace(scene.gaussians, means=scene.gaussians.means + torch.from_numpy(shift).float())
     again = np.array(background_boxes(replace(scene, gaussians=moved, floor=2.0), 2.0)) - shift
     bounds = np.stack([again[:, 0].min(0), again[:, 1].max(0)])
-    np.testing.assert_allclose(bounds, [low, high], atol=0.01)  # to a voxel, as means are rounded
-    assert abs(high[2] - 0.3) < 0.01 and 0 < low[2] < 0.02 and abs(high[1] - 0.2) < 0.01  # the region ends there
+    np.testing.assert_allclose(bounds, [low, high], atol=0.01)  # equal to a voxel, because means are rounded
+    assert abs(high[2] - 0.3) < 0.01 and 0 < low[2] < 0.02 and abs(high[1] - 0.2) < 0.01  # limits of the region

@@ -1,4 +1,4 @@
-"""A ball that rolls over the edge of a box, against mechanics and the distance to the box."""
+"""A ball that rolls over the edge of a box, compared with mechanics and with the distance to the box."""
 
 import math
 
@@ -21,10 +21,12 @@ def distance_to_box(points: Tensor) -> Tensor:
 
 
 def leaving_speed(speed: float, inertia: float) -> float:
-    """Horizontal speed [m/s] of a ball that has left an edge: it pivots about it until its weight no longer holds it
-    there, v^2 = g r cos(angle), with (1 + inertia) (v^2 - speed^2) = 2 g r (1 - cos(angle)).
+    """Horizontal speed [m/s] of a ball after leaving an edge.
 
-    inertia: in m r^2, 2/5 if it does not slip and 0 without friction.
+    It pivots about the edge until its weight no longer holds it there: v^2 = g r cos(angle), with
+    (1 + inertia) (v^2 - speed^2) = 2 g r (1 - cos(angle)).
+
+    inertia: relative to m r^2; 2/5 without slip, 0 without friction.
     """
     froude = speed**2 / (G * RADIUS)
     cosine = ((1 + inertia) * froude + 2) / (3 + inertia)
@@ -33,8 +35,10 @@ def leaving_speed(speed: float, inertia: float) -> float:
 
 @pytest.mark.parametrize("engine", ["ngff", "rigid"])
 def test_leaves_an_edge_with_the_speed_of_mechanics_and_stays_outside(tmp_path, device, engine):
-    """It slips on the last part of the edge, where the angle is steeper than friction holds. The hull of the box's
-    Gaussians ends a third of their spacing within its edges."""
+    """Its speed is between those without slip and without friction, because it slips on the last part of the edge.
+
+    The hull of the box's Gaussians ends 1/3 of their spacing within its edges.
+    """
     cube = box((SIDE, SIDE, SIDE), SIDE / 32).moved((0.0, 0.0, SIDE / 2))
     ball = ellipsoid((RADIUS,) * 3, 2000).moved((SIDE / 4, 0.0, SIDE + RADIUS))
     scene = scene_of((cube, ball))
@@ -44,5 +48,5 @@ def test_leaves_an_edge_with_the_speed_of_mechanics_and_stays_outside(tmp_path, 
     assert distance_to_box(centre).min() > RADIUS - 0.4 * SIDE / 32
     flying = (centre[:, 0] > SIDE / 2 + 0.7 * RADIUS) & (centre[:, 2] > 2 * RADIUS)
     speed = (centre[flying].diff(dim=0)[:, 0] / DT).mean()
-    rolling = 5 / 7 * SPEED  # of a ball that slid at first
+    rolling = 5 / 7 * SPEED  # speed of a ball that initially slid
     assert 0.98 * leaving_speed(rolling, 0.4) < speed < 1.02 * leaving_speed(rolling, 0.0)

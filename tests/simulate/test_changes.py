@@ -1,4 +1,4 @@
-"""Conditions that change during a simulation, uneven bodies and options, with every engine."""
+"""Changes of conditions during a simulation, bodies of uneven density, and options, with every engine."""
 
 import json
 import math
@@ -42,14 +42,14 @@ def frames(scene: Scene, prompts: ForcePrompts, **chosen) -> list:
 
 @pytest.fixture(scope="module")
 def apart() -> Scene:
-    """Two balls of radius .15 in the air."""
+    """Two balls of radius 0.15 in the air."""
     parts = [ball((x, 0, 1.0), 0.15, 600, (1, 0, 0), i, seed=i) for i, x in ((1, -1.0), (2, 1.0))]
     return Scene(concatenate(parts), (SceneObject(1, "a", "common"), SceneObject(2, "b", "common")), None, 0.0)
 
 
 @pytest.mark.parametrize("engine", ["rigid", "mpm", "ngff"])
 def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
-    """A force on 1, which becomes rubber at .1 s; 2 is pinned from .1 s to .2 s. Without gravity until .2 s."""
+    """Body 1 is pushed and becomes rubber at 0.1 s; 2 is pinned from 0.1 to 0.2 s. Gravity is zero until 0.2 s."""
     changes = (Change("material", "rubber", 0.1, 1), Change("pinned", True, 0.1, 2),
                Change("pinned", False, 0.2, 2), Change("gravity", 2.0, 0.2))  # fmt: skip
     prompts = ForcePrompts((Force(1, (0.0, 20.0, 0.0)),), velocity={2: (1.0, 0.0, 0.0)}, changes=changes)
@@ -67,7 +67,7 @@ def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
 
 
 def test_what_rests_in_photos_moves_when_its_material_or_gravity_changes(apart, monkeypatch):
-    """What holds the balls is not seen. Ball 1 gets another material at .04 s, which has it fall; later both fall."""
+    """The support of the balls is not visible. Ball 1 falls when its material changes at 0.04 s, later both fall."""
     monkeypatch.setattr(rigid, "held_as_seen", lambda scene, options: True)
     changes = Change("material", "rubber", 0.04, 1), Change("gravity", 5.0, 0.1)
     z = torch.stack([s.com[:, 2] for s in frames(apart, ForcePrompts(changes=changes), engine="rigid", steps=9)])
@@ -76,7 +76,7 @@ def test_what_rests_in_photos_moves_when_its_material_or_gravity_changes(apart, 
 
 
 def test_a_ball_rebounds_by_the_loss_of_the_material_that_it_has_become(apart):
-    """From the floor, without gravity; of another material from the start, it rebounds alike."""
+    """It rebounds from the floor, without gravity, as if it had the material from the start."""
     speeds = {}
     rubber = Change("material", "rubber", 0.04, 1)
     for name, given, changes in (("before", (), ()), ("after", ("1=rubber",), ()), ("changed", (), (rubber,))):
@@ -94,12 +94,12 @@ def test_the_first_frame_is_the_lifted_scene(apart, engine):
     up = 0.5 * (keypoints.object_id == 2)[:, None] * torch.tensor([0.0, 0.0, 1.0])
     torch.testing.assert_close(first.positions, keypoints.rest + up)
     assert first.com[:, 2].tolist() == pytest.approx([1.0, 1.5], abs=0.02)
-    assert float((second.com - first.com).norm(dim=1).max()) < 0.005  # 2 mm of fall
+    assert float((second.com - first.com).norm(dim=1).max()) < 0.005  # a fall by 2 mm
 
 
 @pytest.mark.parametrize("engine", ["rigid", "mpm"])
 def test_the_centre_of_mass_of_an_uneven_bar(tmp_path, monkeypatch, engine):
-    """The half at x < 0 of a bar of length .4 is four times as dense: the centre is at -3/20 of the length."""
+    """In a bar of length 0.4 the half at x < 0 is four times as dense, so the centre is at -3/20 of the length."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=6000, step=0.027))
     bar = box((0.4, 0.1, 0.1), 0.0125).moved((0, 0, 1.0))
     bar = to_gaussians(bar, torch.full((len(bar.points), 3), 0.5), 1)
@@ -119,7 +119,7 @@ def test_a_fine_setup_has_half_the_spacing_and_the_same_mass(apart):
 
 
 def test_bodies_end_where_their_lowest_voxels_are_filled(apart, monkeypatch):
-    """Columns of voxels of edge .1, of the lowest of which the upper 30 % are filled, end .07 above the floor."""
+    """The lowest of voxels with edge 0.1 are filled in their upper 30 %, so the body ends 0.07 above the floor."""
     h, rng = 0.1, torch.Generator().manual_seed(0)
     cells = torch.cartesian_prod(torch.arange(4), torch.arange(4), torch.arange(5))
     volume = h**3 * torch.where(cells[:, 2] == 0, 0.3, 1.0)
@@ -133,7 +133,7 @@ def test_bodies_end_where_their_lowest_voxels_are_filled(apart, monkeypatch):
 
 
 def test_only_what_is_below_the_floor_after_a_lift_is_placed_on_it(apart):
-    """Balls that end .85 above the floor: one is lowered by .95, the other lifted by 1.2."""
+    """Two balls end 0.85 above the floor; one is lowered by 0.95, the other lifted by 1.2."""
     setup = set_up_scene(apart, ForcePrompts(lift={1: -0.95, 2: 1.2}), SimulateOptions(quality="draft"))
     h, body = setup.bodies.spacing, setup.bodies.body
     assert setup.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, 0.1], abs=0.5 * h)
@@ -157,7 +157,7 @@ def test_gravity_wakes_all_objects_and_other_changes_their_own():
 
 @pytest.mark.parametrize("gravity", [-1.0, 0.0, 0.5, 9.81])
 def test_what_moves_at_the_start_or_is_not_held_down_is_awake(gravity):
-    """Four objects: at rest, with a velocity, lifted, and with both of one unit."""
+    """Four objects: at rest, with a velocity, lifted, and with a velocity and a lift of one unit each."""
     velocity, lift = torch.zeros(1, 4, 3), torch.zeros(4, 3)
     velocity[0, 1, 2], lift[2, 2], velocity[0, 3], lift[3] = -0.3, 0.2, 1.0, 1.0
     awake = _starts_awake(SimpleNamespace(velocity=velocity), SimpleNamespace(gravity=gravity),
@@ -166,7 +166,7 @@ def test_what_moves_at_the_start_or_is_not_held_down_is_awake(gravity):
 
 
 def test_a_sliding_body_has_the_friction_of_its_new_material():
-    """Two boxes slide on the floor by v^2 / 2 mu g; the second becomes rubber at the start."""
+    """Two boxes slide by v^2 / 2 mu g on the floor; the second one becomes rubber at the start."""
     flat = [box((0.2, 0.2, 0.1), 0.02).moved((x, 0.0, 0.05)) for x in (-0.5, 0.5)]
     g = concatenate([to_gaussians(s, torch.full((len(s.points), 3), 0.5), i, widest=math.inf)
                      for i, s in enumerate(flat, 1)])  # fmt: skip
@@ -189,7 +189,7 @@ def test_new_materials_and_pins_reach_the_solver_of_mpm():
     for name in ("mass", "stiffness", "held", "friction", "plastic"):
         assert torch.equal(getattr(solver.particles, name), getattr(new, name)), name
         assert getattr(particles, name) is getattr(new, name)
-    moving = (~half).float()[:, None]  # what is pinned stops
+    moving = (~half).float()[:, None]  # pinned particles stop
     assert torch.equal(solver.particles.v, moving * torch.tensor([1.0, -2.0, 3.0]))
     assert torch.equal(solver.particles.C, moving[..., None] * torch.eye(3))
 
@@ -205,7 +205,7 @@ def test_forces_on_particles_sum_to_the_force_and_the_torque_that_are_asked_for(
     particles = SimpleNamespace(mass=mass, held=torch.zeros(40))
     push, turn = torch.tensor([1.0, -2.0, 3.0]), torch.tensor([0.5, 0.2, -0.3])
     force = Force(1, tuple(push.tolist()), tuple(turn.tolist()), start=0.0, end=0.3)
-    a = _PromptedForce(force, particles, setup, 0).acceleration(x, 0.2, 0.4)  # acts half the time
+    a = _PromptedForce(force, particles, setup, 0).acceleration(x, 0.2, 0.4)  # acts during half of the time
     total = (mass[:, None] * a)[:30]
     torch.testing.assert_close(total.sum(0), push / 2)
     centre = (mass[:30, None] * x[:30]).sum(0) / mass[:30].sum()
@@ -214,7 +214,7 @@ def test_forces_on_particles_sum_to_the_force_and_the_torque_that_are_asked_for(
 
 
 def test_a_force_at_a_point_acts_on_the_particles_near_it():
-    """Gaussian weights of width 4 spacings about the nearest particle, none beyond twice that."""
+    """Weights are Gaussian with a width of 4 spacings about the nearest particle, and zero beyond 8 spacings."""
     x = torch.tensor([[0.2, 0, 0], [0.6, 0, 0], [0.95, 0, 0], [1.05, 0, 0]])
     particles = SimpleNamespace(mass=torch.ones(4), held=torch.zeros(4))
     a = _PromptedForce(Force(1, (1.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)), particles, small_setup(x, [0] * 4), 0)

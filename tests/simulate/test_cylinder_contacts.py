@@ -15,7 +15,7 @@ UP = [0.0, 0.0, 1.0]
 
 
 def contacts(at, axis, radius: float = 1.0, half: float = 2.0):
-    """Positions, normals and depths of a cylinder around the z axis of radius 1 from z = -2 to 2, and another one."""
+    """Positions, normals and depths of contacts between a cylinder about z (radius 1, z = -2 to 2) and another one."""
     axes = np.array([[UP, axis / np.linalg.norm(axis)]])
     row, x, normal, depth, beside = side_contacts(
         np.array([[[0.0] * 3, at]]), axes, np.array([[1.0, radius]]), np.array([[2.0, half]])
@@ -27,7 +27,7 @@ def contacts(at, axis, radius: float = 1.0, half: float = 2.0):
 @pytest.mark.parametrize("depth", [-1e-3, 0.0, 1e-9, 1e-3])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_parallel_cylinders_touch_at_both_ends_of_the_length_along_which_they_are_beside_each_other(depth, sign):
-    """Of radii 1 and .5, from z = -2 to 2 and from 0 to 2.5."""
+    """Their radii are 1 and 0.5, and they extend from z = -2 to 2 and from 0 to 2.5."""
     turn = np.array([math.sin(0.3), math.cos(0.3), 0.0])
     x, normal, found = contacts((1.5 - depth) * turn + [0, 0, 1.25], np.array([0, 0, sign]), 0.5, 1.25)
     deep = found > depth - 1e-9
@@ -40,7 +40,7 @@ def test_parallel_cylinders_touch_at_both_ends_of_the_length_along_which_they_ar
 
 @pytest.mark.parametrize("degrees", [30, 90, 150])
 def test_crossed_cylinders_touch_where_their_axes_are_nearest(degrees):
-    """They are so at (0, 0, .3) and .2 from the middle of the second cylinder."""
+    """The nearest point is (0, 0, 0.3), at 0.2 from the middle of the second cylinder."""
     along = np.array([math.sin(math.radians(degrees)), 0, math.cos(math.radians(degrees))])
     x, normal, depth = contacts(np.array([0, 1.99, 0.3]) - 0.2 * along, along)
     k = depth > 0
@@ -62,13 +62,13 @@ def test_a_slightly_turned_cylinder_touches_at_the_lower_end():
     [((0.0, 0, 3.99), UP), ((0.9, 0, 3.99), UP), ((2.99, 0, 0), [1.0, 0, 0]), ((0, 0, 3.0), [1.0, 0, 0.0])],
 )
 def test_contacts_with_an_end_are_none_of_the_sides(at, axis):
-    """One on the other, also off its middle; an end against a side, and a side against an end."""
+    """One on the other, centred and off-centre; an end on a side, and a side on an end."""
     assert len(contacts(np.array(at), np.array(axis))[0]) == 0
 
 
 @pytest.mark.parametrize(("friction", "stands"), [(0.24, False), (0.3, True)])
 def test_a_log_on_two_others_stays_if_friction_exceeds_the_tangent_of_15_degrees(tmp_path, friction, stands):
-    """Of .268: the force between two logs acts along the line through their contact and that with the floor."""
+    """The force between two logs must act along the line through their contact and the floor contact: tangent 0.268."""
     log = torch.from_numpy(0.1 * cylinder(3.0)[:, [0, 2, 1]]).float()
     out = torch.nn.functional.normalize(log, dim=1)
     places = ((-0.1, 0.1), (0.1, 0.1), (0.0, 0.1 + 0.1 * math.sqrt(3)))

@@ -1,4 +1,4 @@
-"""The engine that `--engine auto` stands for."""
+"""The engine that `--engine auto` selects."""
 
 import json
 import logging
@@ -42,7 +42,7 @@ def test_what_is_a_hundred_times_larger_is_softer():
 
 @pytest.mark.parametrize(("speed", "lift", "engine"), [(-1.0, 0.0, "rigid"), (-4.0, 0.0, "mpm"), (0.0, 0.7, "mpm")])
 def test_what_an_impact_compresses_is_soft(speed, lift, engine):
-    """Of E 8e5 and 600 kg/m^3: 3.65 m/s, or a fall of .68 m, compress it by a tenth. Its name does not matter."""
+    """With E = 8e5 and 600 kg/m^3, 3.65 m/s or a fall of 0.68 m compresses by 10 %. The name has no influence."""
     scene = two_balls_scene()
     prompts = ForcePrompts(velocity={1: (0.0, 0.0, speed)}, lift={1: lift})
     options = SimulateOptions(material=("1=ball",))
@@ -58,8 +58,7 @@ def test_what_an_impact_compresses_is_soft(speed, lift, engine):
 ])  # fmt: skip
 @pytest.mark.parametrize("why", ["photos", "live"])
 def test_soft_bodies_slide_by_the_engine_that_has_friction(why, material, prompts, engine):
-    """A slide of any object, beside a soft one; the learned field, which these scenes are for, stops all of them after
-    the same distance."""
+    """Any object slides beside a soft one; the learned field would stop all of them after the same distance."""
     scene = two_balls_scene()
     scene = replace(scene, provenance={"command": "reconstruct"}) if why == "photos" else scene
     options = SimulateOptions(material=(f"1={material}",), live=why == "live")
@@ -78,8 +77,10 @@ def of_two(lower: Surface, upper: Surface) -> Scene:
 
 @pytest.mark.parametrize(("density", "lift", "engine"), [(20, 0.0, "rigid"), (800, 0.0, "mpm"), (100, 0.5, "mpm")])
 def test_what_is_above_a_soft_body_compresses_it(tmp_path, density, lift, engine):
-    """A cube of foam of 1e4 Pa under one of half its side: .015 by its own weight, and density g .15 / E = .003 or
-    .118 by that of the other. One of 100 kg/m^3 that falls .5 m has the speed 3.1 m/s: 3.1 sqrt(100 / 2 / E) = .22.
+    """A cube of foam with E = 1e4 Pa under a cube with half its side.
+
+    Its own weight compresses it by 0.015, that of the other cube by density g 0.15 / E = 0.003 or 0.118. A cube of
+    100 kg/m^3 that falls 0.5 m has the speed 3.1 m/s and compresses it by 3.1 sqrt(100 / 2 / E) = 0.22.
     """
     scene = of_two(block((0.3,) * 3, 0.0), block((0.15,) * 3, 0.3))
     (tmp_path / "m.json").write_text(json.dumps({"1": {"E": 1e4, "density": 50}, "2": {"E": 1e9, "density": density}}))
@@ -92,7 +93,7 @@ def test_what_is_above_a_soft_body_compresses_it(tmp_path, density, lift, engine
 
 @pytest.mark.parametrize(("force", "engine"), [(0.9, "rigid"), (1.1, "mpm")])
 def test_a_force_compresses_a_soft_body(tmp_path, force, engine):
-    """On a face of .1 x .1 m of 1e4 Pa: 1 N compresses by .01, 2 N by .02."""
+    """On a face of 0.1 x 0.1 m and with E = 1e4 Pa, 1 N compresses by 0.01, 2 N by 0.02."""
     scene = of_two(block((0.1,) * 3, 0.0), block((0.1,) * 3, 0.3))
     (tmp_path / "m.json").write_text(json.dumps({"1": {"E": 1e4, "density": 20}, "2": {"E": 1e9, "density": 1}}))
     options = SimulateOptions(materials=tmp_path / "m.json")
@@ -109,7 +110,7 @@ def test_a_cloth_that_is_off_the_floor_bends(bottom, engine):
 
 
 def test_droop_of_a_cantilever():
-    """w L^4 / (8 E I) with w = rho g b t and I = b t^3 / 12, over L."""
+    """w L^4 / (8 E I), divided by L, with w = rho g b t and I = b t^3 / 12."""
     assert droop(Material(E=1e6, density=1000.0), [0.01, 0.1, 0.4], 10.0) == pytest.approx(
         1000 * 10 * 0.1 * 0.01 * 0.2**4 / (8 * 1e6 * 0.1 * 0.01**3 / 12) / 0.2)  # fmt: skip
 
@@ -120,13 +121,13 @@ def test_sag_of_a_column():
 
 
 def test_a_part_that_is_pinned_holds_the_whole_of_an_object_but_in_mpm(tmp_path, caplog):
-    caplog.set_level(logging.WARNING, logger="stages")  # commands that ran before leave it at INFO
+    caplog.set_level(logging.WARNING, logger="stages")  # earlier commands may have set it to INFO
     file = tmp_path / "m.json"
     parts = [{"below": 0.1, "material": "steel", "pinned": True}, {"material": "soft"}]
     file.write_text(json.dumps({"1": {"parts": parts}, "2": {"parts": [{"below": 1, "material": "wood"}, parts[1]]}}))
     scene, prompts = two_balls_scene(), ForcePrompts(pinned=frozenset({7}))
     options = SimulateOptions(materials=file)
-    assert with_engine(options, scene, choose_keypoints(scene, 32)).engine == "mpm"  # for its parts
+    assert with_engine(options, scene, choose_keypoints(scene, 32)).engine == "mpm"  # because of its parts
     assert for_engine(prompts, scene, replace(options, engine="mpm")) == prompts and not caplog.text
     assert for_engine(prompts, scene, replace(options, engine="rigid")).pinned == {1, 7}
     first, second = caplog.messages

@@ -1,4 +1,4 @@
-"""Heaps of random bodies that fall on each other: nothing sinks in, and impacts give no energy."""
+"""Heaps of random bodies that fall on each other do not penetrate, and impacts do not add energy."""
 
 from collections.abc import Callable
 
@@ -26,7 +26,7 @@ def bar(sides: tuple, at: tuple, spacing: float) -> tuple[Surface, Callable[[Ten
 
 
 def body(shape: str, s: float, rng: np.random.Generator) -> Surface:
-    """A body of about the size s [m]."""
+    """A body of about this size [m]."""
     t, spacing = 0.18 * s, s / 20
     if shape == "box":
         return box((s, s * rng.uniform(0.4, 1), s * rng.uniform(0.3, 1)), spacing)
@@ -44,7 +44,7 @@ def body(shape: str, s: float, rng: np.random.Generator) -> Surface:
 
 
 def heap(seed: int) -> tuple[Scene, str]:
-    """Four to six bodies of random shapes, sizes and directions above each other, and their materials as JSON."""
+    """Four to six bodies of random shapes, sizes and orientations above each other, and their materials as JSON."""
     rng = np.random.default_rng(seed)
     parts, materials = [], []
     for i in range(4 + seed % 3):

@@ -1,4 +1,4 @@
-"""Overlaps at the start: what is allowed follows the actual overlap down, and not up again."""
+"""Initial overlaps: the allowed overlap decreases with the actual overlap, and does not increase again."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The learned engine: scaling to the training data, force prompts, warnings."""
+"""The learned engine: scaling to the training data, force prompts and warnings."""
 
 import json
 import logging
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("device")
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
-    """Weights of a small untrained force field; free fall, forces and pins do not depend on training."""
+    """Weights of a small untrained force field; free fall, forces and pins must not depend on training."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     save(path, "ngff", build("ngff", hidden=8), {"warning": "untrained"})
@@ -57,7 +57,7 @@ def com_shift(t, row, frame=-1):
 
 @pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.1])
 def test_free_fall_at_any_scale(two_balls, tmp_path, untrained, unit):
-    """By the command."""
+    """Run as a stage, from file to file."""
     write_scene(tmp_path / "scene.ply", replace(two_balls, scale={"metres_per_unit": unit, "source": "test"}))
     run(tmp_path / "scene.ply", tmp_path / "t.h5", options_with(untrained, lift=("2=2",)))
     t = read_trajectory(tmp_path / "t.h5")
@@ -80,17 +80,17 @@ def test_velocity_and_force_in_flight(two_balls, untrained, caplog):
 
 @pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.1])
 def test_newtons_kilograms_and_velocities_at_any_scale(untrained, caplog, unit):
-    """F t^2 / 2 m of a ball of 540 kg/m^3, and a velocity in scene units per second, without gravity."""
+    """F t^2 / 2 m for a ball of 540 kg/m^3, and a velocity in scene units per second, without gravity."""
     caplog.set_level(logging.INFO)
     parts = [ball((x, 0, 1.0), 0.15, 1500, (1, 0, 0), i, seed=i) for i, x in ((1, -1.0), (2, 1.0))]
     objects = (SceneObject(1, "thing", "common"), SceneObject(2, "thing", "common"))
     scene = Scene(concatenate(parts), objects, None, 0.0, {"metres_per_unit": unit, "source": "test"})
-    newton = 20 * unit**4  # by which both move alike
+    newton = 20 * unit**4  # a force that causes comparable motion at both scales
     t = roll(scene, untrained, gravity=0.0, velocity=("object=1 1,2,0",),
              force=(f"object=2 force=0,0,{newton}",))  # fmt: skip
     assert com_shift(t, 0).tolist() == pytest.approx([0.1, 0.2, 0], abs=1e-3)
     volume = 4 / 3 * math.pi * (0.15 * unit) ** 3
-    assert t.field.volume.tolist() == pytest.approx([volume] * 2, rel=0.08)  # of 1,500 points
+    assert t.field.volume.tolist() == pytest.approx([volume] * 2, rel=0.08)  # the tolerance is for 1,500 points
     mass = 540 * float(t.field.volume[1])
     assert float(t.field.mass[1]) == pytest.approx(mass * t.field.units.mass, rel=1e-5)
     assert com_shift(t, 1).tolist() == pytest.approx([0, 0, newton * 0.1**2 / (2 * mass) / unit], rel=0.02, abs=1e-5)
@@ -106,7 +106,8 @@ def test_pinned_objects_stay_and_frame_rate_does_not_matter(two_balls, untrained
     coarse = roll(two_balls, untrained, lift=("2=2",), pin=("1",), dt=0.05, steps=3)
     assert float(com_shift(coarse, 1)[2]) == pytest.approx(float(com_shift(t, 1)[2]), rel=0.01)
     fine = roll(two_balls, untrained, lift=("2=2",), dt=0.002, steps=1)
-    for motion, dt in ((t, SimulateOptions().dt), (coarse, 0.05), (fine, 0.002)):  # the fewest of at most FRAME
+    # the smallest number for which no step exceeds FRAME
+    for motion, dt in ((t, SimulateOptions().dt), (coarse, 0.05), (fine, 0.002)):
         frame, steps = dt * motion.field.units.time, motion.field.units.steps
         assert steps - 1 < frame / FRAME <= steps * (1 + 1e-5)
 
@@ -119,7 +120,7 @@ def test_an_object_far_below_the_floor_is_named(untrained, caplog):
 
 
 def test_objects_below_the_floor_are_not_lifted_into_others():
-    """A ball 12 cm below the plane (as on a sagging seat), under the side of a larger one; small forces wake both."""
+    """A ball is 12 cm below the plane (as on a soft seat), beside and under a larger one; small forces wake both."""
     high, low = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.2, 0, -0.02), 0.1, 600, (0, 1, 0), 2, seed=1)
     scene = Scene(concatenate([high, low]), (SceneObject(1, "ball"), SceneObject(2, "ball")), None, 0.0)
     small = tuple(f"object={i} force=0,0,0.01 to=0.02" for i in (1, 2))
@@ -129,7 +130,7 @@ def test_objects_below_the_floor_are_not_lifted_into_others():
 
 
 def transformed(scene, unit, floor):
-    """The scene in units of `unit` metres, on a floor at another height."""
+    """The scene in units of `unit` [m], on a floor at a different height."""
     g = scene.gaussians
     up = torch.tensor([0.0, 0.0, floor])
     g = replace(g, means=g.means / unit + up, scales=g.scales / unit)
@@ -137,10 +138,10 @@ def transformed(scene, unit, floor):
 
 
 def test_units_and_floor_height_do_not_matter(two_balls):
-    """With the shipped weights. Floor height shifts the 2 cm voxels from which contact with the floor is determined."""
+    """With the shipped weights. The floor height shifts the voxels of 2 cm that define contact with the floor."""
 
     def motion(scene, unit=1.0):
-        t = roll(scene, find("ngff", SHIPPED), steps=8, lift=(f"2={-0.23 / unit}",))  # to 5 cm above the floor
+        t = roll(scene, find("ngff", SHIPPED), steps=8, lift=(f"2={-0.23 / unit}",))  # down to 5 cm above the floor
         return unit * (t.positions - t.positions[0])
 
     here = motion(two_balls)
@@ -154,8 +155,9 @@ def test_scenes_are_brought_to_the_size_mass_and_gravity_of_training(size):
     cube = size * torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     units = ModelUnits.for_objects([cube, 4 * cube], torch.tensor([2.0, 8.0]), 2.0, 1.0, 10.0)
     assert units.length == pytest.approx(TYPICAL_SIZE / (2 * size)) and units.mass == pytest.approx(TYPICAL_MASS / 4)
-    assert units.time == pytest.approx((2 * units.length) ** 0.5)  # lengths over gravity
-    assert units.force * 10 * 4 == pytest.approx(TYPICAL_MASS * 5 * units.mass * 4 / TYPICAL_MASS)  # weight to weight
+    assert units.time == pytest.approx((2 * units.length) ** 0.5)  # follows from lengths and gravity
+    # converts weight to weight
+    assert units.force * 10 * 4 == pytest.approx(TYPICAL_MASS * 5 * units.mass * 4 / TYPICAL_MASS)
     middle = 1.25 * size  # the mean of all corners
     here = units.to_model(torch.tensor([middle, middle + 1, 3.0]))
     torch.testing.assert_close(here, torch.tensor([0.0, units.length, units.length + FLOOR]), atol=1e-4, rtol=1e-4)
@@ -169,8 +171,8 @@ def resized(scene, factor):
 def test_size_and_unit_of_mass_do_not_matter(two_balls, tmp_path):
     """Exact symmetries: lengths and gravity times c with moduli times c^2, and masses with moduli times c.
 
-    With the shipped weights, through a collision with the floor. What is left is rounding, which contact amplifies, and
-    voxels that start elsewhere.
+    The motion, with the shipped weights, includes a collision with the floor. The remaining differences are from
+    rounding, which contact amplifies, and from voxels with different origins.
     """
     scenes = {size: resized(two_balls, size) for size in (1.0, 0.01, 128.0)}
 
@@ -189,7 +191,7 @@ def test_size_and_unit_of_mass_do_not_matter(two_balls, tmp_path):
 
 @pytest.mark.parametrize("shape", ["ball", "box"])
 def test_solid_bodies_turn_as_solid_bodies(untrained, shape):
-    """Angle t^2 torque / (2 I) with the inertia of the filled body; 8 %: the volume follows from 1,500 points."""
+    """The angle is t^2 torque / (2 I) with the inertia of a filled body, to 8 % because of 1,500 points."""
     side, torque = 0.3, 0.02
     rng = torch.Generator().manual_seed(0)
     x = torch.randn(1500, 3, generator=rng)
@@ -203,7 +205,8 @@ def test_solid_bodies_turn_as_solid_bodies(untrained, shape):
     u, _, v = torch.linalg.svd(end.T @ start)
     R = u @ v
     angle = math.atan2(float(R[1, 0] - R[0, 1]), float(R[0, 0] + R[1, 1]))
-    volume, ratio = (math.pi / 6, 0.1) if shape == "ball" else (1.0, 1 / 6)  # of the cube on the side; I / (m side^2)
+    # volume relative to the cube of the side, and I / (m side^2)
+    volume, ratio = (math.pi / 6, 0.1) if shape == "ball" else (1.0, 1 / 6)
     inertia = ratio * side**2 * 540 * volume * side**3
     assert angle == pytest.approx(0.12**2 / 2 * torque / inertia, rel=0.08)
 
@@ -248,7 +251,7 @@ def test_plastic_materials_are_warned_of(two_balls, untrained, caplog):
     ("rubber", "soft"), pytest.param("soft", "rubber", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_solid_ball_lands_and_keeps_its_shape(two_balls, first, second):
-    """With the shipped weights, dropped from 0.3 m, or 0.6 m."""
+    """With the shipped weights, balls are dropped from 0.3 m and 0.6 m."""
     t = roll(two_balls, find("ngff", SHIPPED), lift=("0.3",), material=(f"1={first}", f"2={second}"), steps=50)
     for i in (1, 2):
         points = t.positions[:, t.keypoints.object_id == i]

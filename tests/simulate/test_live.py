@@ -1,4 +1,4 @@
-"""Live sessions: what was done is repeated exactly, hostile clients change nothing, and a page drags objects."""
+"""Live sessions: recordings are repeated exactly, hostile clients change nothing, and a page can drag objects."""
 
 import json
 import os
@@ -43,11 +43,11 @@ exceptions = pytest.importorskip("websockets.exceptions")
 FIND_RED = """() => {
   for (let y = 20; y < 340; y += 8) for (let x = 200; x < 470; x += 8)
     if (player.pick(x, y)?.object === 1) return [x + 8, y + 16];
-}"""  # a point of object 1 in the part of the page without the panel [px]
+}"""  # returns a point of object 1 in the part of the page without the panel [px]
 RED_HEIGHT = """() => {
   const ids = player.film.arrays.keypoint_object, own = [...ids.keys()].filter((k) => ids[k] === 1);
   return own.reduce((sum, k) => sum + player.positions[3 * k + 2] - player.rest[3 * k + 2], 0) / own.length;
-}"""  # how far object 1 has risen
+}"""  # returns the mean rise of object 1
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -98,7 +98,7 @@ def world():
 
 
 def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
-    """Keypoints of a session with messages at some frames, the session, and the motion of its prompts."""
+    """Keypoints of a session with messages in some frames, the session, and a function that repeats given prompts."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, step=0.017))
     contact = "learned" if engine == "ngff" else AUTO
     options = SimulateOptions(engine=engine, contact=contact, quality="draft", steps=frames, keypoints=32, box=box)
@@ -123,7 +123,7 @@ def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,
 
 
 def a_busy_user(n, state):
-    """Drags the red ball up, pushes the green one, then changes gravity, friction and a material, and pins."""
+    """Drag the red ball up, push the green one, change gravity, friction and a material, and pin an object."""
     red = [-0.3, 0.0, 0.3]
     return {
         2: [{"do": "grab", "object": 1, "point": red, "target": red}],
@@ -138,7 +138,7 @@ def a_busy_user(n, state):
 
 @pytest.fixture(scope="module")
 def busy_session(world):
-    """Makes the session of a busy user, once for each engine."""
+    """Function that returns the session of a busy user, cached by engine."""
     with pytest.MonkeyPatch.context() as patch:
         yield cache(lambda engine: live_session(world, engine, patch, a_busy_user))
 
@@ -149,8 +149,8 @@ def test_a_record_repeats_the_motion_exactly(busy_session, engine):
     record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))
     assert torch.equal(live, motion_of(record))
     red = keypoints.object_id == 1
-    assert (live[14, red] - live[2, red]).mean(0)[2] > 0.05  # dragged up
-    assert (live[20:, red] - live[21, red]).norm(dim=-1)[1:].max() < 1e-5  # pinned
+    assert (live[14, red] - live[2, red]).mean(0)[2] > 0.05  # it was dragged up
+    assert (live[20:, red] - live[21, red]).norm(dim=-1)[1:].max() < 1e-5  # it was pinned
     assert {row.get("what") for row in session.record} == {None, "gravity", "friction", "material", "pinned"}
 
 
@@ -179,13 +179,13 @@ PAGE_SESSION = """async ([frames, actions]) => {
 
 @pytest.mark.usefixtures("device")
 def test_a_page_without_server_answers_alike(busy_session, tmp_path, open_page):
-    """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
+    """The engine and the page of a playable film respond to the same messages with the same motion."""
     live, *_ = busy_session("ngff")
     assert (page_session(tmp_path, open_page, a_busy_user) - live[-1]).norm(dim=1).max() < 1e-3
 
 
 def page_session(folder, open_page, actions, frames=26, box="-1,-1,0,1,1,2"):
-    """Keypoints after a session like `live_session` in a page without server."""
+    """Keypoints after a session like `live_session`, in a page without a server."""
     write_scene(folder / "scene.ply", two_balls_scene())
     options = SimulateOptions(engine="ngff", contact="learned", quality="draft", steps=2, keypoints=32, box=box)
     run(folder / "scene.ply", folder / "traj.h5", options)
@@ -195,7 +195,7 @@ def page_session(folder, open_page, actions, frames=26, box="-1,-1,0,1,1,2"):
 
 
 def a_user_against_the_walls(n, state):
-    """Pulls the red ball far beyond a wall, throws the green one at another, and lifts it to above the ceiling."""
+    """Pull the red ball far beyond a wall, throw the green one at another wall, and lift it above the ceiling."""
     return {
         0: [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": [-3.0, 0.1, 0.4]}],
         2: [{"do": "push", "object": 2, "point": [0.3, 0.0, 0.3], "direction": [0.0, 1.0, 0.0], "strength": 3.0}],
@@ -277,7 +277,7 @@ def test_page_needs_the_token_and_the_host(server):
                   "POST / HTTP/1.1\r\n\r\n", f"GET /../../etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"):  # fmt: skip
         assert b"page" not in answer(server, wrong.encode())
     assert b"page" not in answer(server, os.urandom(5000))
-    with pytest.raises(OSError):  # other addresses of this machine
+    with pytest.raises(OSError):  # other addresses of this machine do not work
         socket.create_connection(("127.0.0.2", server.port), timeout=1)
 
 
@@ -327,7 +327,8 @@ def test_frames_wait_until_the_last_is_drawn(server):
 
 
 def test_hostile_clients_are_closed_and_others_go_on(server, monkeypatch):
-    monkeypatch.setattr(live_server, "time", SimpleNamespace(monotonic=lambda: 7.0))  # messages arrive in one second
+    # all messages arrive within one second
+    monkeypatch.setattr(live_server, "time", SimpleNamespace(monotonic=lambda: 7.0))
     with client(server) as good:
         good.recv(timeout=LONGEST)
         for hostility in (["garbage"] * 20, [b"\x00" * 100] * 20, ["x" * 10_000_000], ['{"do": "drawn"}'] * 2000):
@@ -358,7 +359,7 @@ def test_a_message_that_is_too_long_ends_the_connection_before_it_is_read(server
 
 
 def test_errors_of_the_event_loop_are_no_tracebacks(server, caplog):
-    """Such as those of connections for which this process has no more file descriptors."""
+    """An example is a connection for which no file descriptor is left."""
     server._loop.call_soon_threadsafe(lambda: 1 / 0)
     with client(server) as good:
         assert json.loads(good.recv(timeout=LONGEST)) == {"control": True}
@@ -386,7 +387,7 @@ def test_two_hundred_connections_leave_nothing_behind(server):
         assert heard(server) == [{"do": "step"}]
 
 
-# --- a session as users have it ---
+# --- a complete session ---
 
 
 def test_an_engine_that_fails_at_the_start_ends_the_command(tmp_path, monkeypatch):
@@ -403,7 +404,7 @@ def test_an_engine_that_fails_at_the_start_ends_the_command(tmp_path, monkeypatc
 
 
 def start_session(folder: Path, *options: str):
-    """The command in a process of its own, on the CPU, where a motion repeats to the bit; and its address."""
+    """Start the command in a separate process on the CPU, where motions are exactly repeatable; and its address."""
     code = "from ngff_cli import ngff; ngff()"
     words = ["simulate", "scene.ply", "-o", "traj.h5", "--live", "--no-browser", "--device", "cpu", *options]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
@@ -436,7 +437,7 @@ def test_the_mouse_drags_an_object_and_the_file_repeats_it(session, open_page):
     process, url, folder = session
     page = open_page(url)
     until(page, "player.live.state !== null && player.live.control")
-    until(page, f"({FIND_RED})() !== undefined")  # once the splats are sorted for the first time
+    until(page, f"({FIND_RED})() !== undefined")  # after the splats have been sorted for the first time
     drag_up(page, page.evaluate(FIND_RED), 24, 5)
     until(page, f"player.live.state.arrows.length === 1 && ({RED_HEIGHT})() > 0.05")
     page.mouse.up()
@@ -461,7 +462,7 @@ def test_a_killed_session_leaves_its_recording(session):
         say(page, do="gravity", value=2.0)
         while (shown := next_frame(page))["gravity"] != 2.0:
             pass
-        until_written = shown["frames"] + (FLUSH_TIME + MAX_LAG) / SimulateOptions.dt  # in real time at most
+        until_written = shown["frames"] + (FLUSH_TIME + MAX_LAG) / SimulateOptions.dt  # frames in this time at most
         while next_frame(page)["frames"] <= until_written + 1:
             pass
     process.kill()

@@ -1,4 +1,4 @@
-"""The loop of a live session against a clock that the test sets: pace, pauses, delays, failures and recordings."""
+"""The loop of a live session with a simulated clock: speed, pauses, delays, failures and recordings."""
 
 import errno
 import json
@@ -24,7 +24,7 @@ from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene
 
 DT = 0.04
-UP = torch.tensor([0.0, 0.0, 1e-3])  # motion in a frame
+UP = torch.tensor([0.0, 0.0, 1e-3])  # displacement per frame
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def still():
 
 
 class Played:
-    """A session whose server hands over `messages[i]` in turn i, and whose frames take `cost` [s]."""
+    """A session whose server returns `messages` in the next turn, and whose frames take `cost` [s]."""
 
     def __init__(self, files, still, folder, monkeypatch, cost=lambda n: 0.0, fail_at=None):
         scene, self.keypoints, binding = still
@@ -68,7 +68,7 @@ class Played:
 
     def publish(self, data):
         (length,) = struct.unpack("<I", data[:4])
-        assert length % 4 == 0  # so that numbers are aligned
+        assert length % 4 == 0  # numbers must be aligned
         header = json.loads(data[4 : 4 + length])
         self.sent.append((header, torch.frombuffer(bytearray(data[4 + length :]), dtype=torch.float32).view(-1, 3)))
 
@@ -77,7 +77,7 @@ class Played:
         return self.sent[-1][0]
 
     def go_on(self, seconds: float, *messages: dict) -> int:
-        """Turns until so much time has passed, the first with these messages; the number of new frames."""
+        """Run turns for so much time, the first one with these messages; returns the number of new frames."""
         end, before, self.messages = self.now + seconds, self.writer.frames, list(messages)
         while self.now < end - 1e-9:
             self.live.turn()
@@ -107,16 +107,16 @@ def test_a_pause_lasts_until_it_is_ended_but_for_steps(play):
     played.go_on(0.4)
     shown, frames = len(played.sent), played.writer.frames
     assert played.go_on(1.0, {"do": "pause", "value": True}) == 0 and played.header["paused"] is True
-    assert len(played.sent) - shown == pytest.approx(1.0 / loop.IDLE_TIME, abs=2)  # still shown
+    assert len(played.sent) - shown == pytest.approx(1.0 / loop.IDLE_TIME, abs=2)  # the state is still sent
     assert played.header["rate"] == 0
     assert played.go_on(0.2, {"do": "step"}, {"do": "step"}) == 2
     assert played.header["time"] == pytest.approx((frames + 1) * DT)
     assert played.go_on(0.4, {"do": "pause", "value": False}) == pytest.approx(0.4 / DT, abs=1)
-    assert played.go_on(0.4, {"do": "step"}) == pytest.approx(0.4 / DT, abs=1)  # only while paused
+    assert played.go_on(0.4, {"do": "step"}) == pytest.approx(0.4 / DT, abs=1)  # steps have an effect only while paused
 
 
 def test_a_slow_engine_is_followed_by_a_quarter_of_a_second_at_most(play):
-    """Frames that take thrice their time for a while: then the clock is .25 s and a frame behind, not 39 frames."""
+    """While frames take three times their duration, the clock is delayed by 0.25 s and a frame, not by 39 frames."""
     played = play(cost=lambda n: 3 * DT if n < 40 else 0.0)
     frames = played.go_on(39 * 3 * DT)
     assert frames == pytest.approx(39, abs=1)
@@ -155,7 +155,7 @@ def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):
     assert {row["kind"] for row in saved.info.forces} == {"force", "change"}
     played.go_on(0.1, {"do": "reset"}, {"do": "pin", "object": 1, "value": True}, {"do": "save"})
     assert played.header["lifted"] == [] and played.header["pinned"] == [1]
-    assert not read_trajectory(played.out.with_name("traj-2.h5")).info.forces  # a new recording
+    assert not read_trajectory(played.out.with_name("traj-2.h5")).info.forces  # the reset started a new recording
     played.writer.store_prompts(played.live.session.record)
     played.files.close()
     whole = read_trajectory(played.out)
@@ -214,7 +214,7 @@ def test_a_push_acts_for_a_frame_and_its_arrow_is_shown_for_two_fifths_of_a_seco
     shown = [a[0] for a in arrows if a]
     assert len(shown) == pytest.approx(0.4 / DT, abs=1) and not arrows[-1]
     tail, end = torch.tensor(shown[0])
-    torch.testing.assert_close(end - tail, torch.tensor([0.0, 0.5, 0.0]))  # .25 for each unit per second
+    torch.testing.assert_close(end - tail, torch.tensor([0.0, 0.5, 0.0]))  # 0.25 per unit per second
     torch.testing.assert_close(end, tip + (first - 1) * UP, atol=2e-3, rtol=0)
     (force,) = [row for row in played.live.session.record if row["kind"] == "force"]
     impulse = force["force"][1] * (force["end"] - force["start"])

@@ -1,4 +1,4 @@
-"""Objects of several materials in the engines: beams bend as theory says, masses add up, what is pinned stays."""
+"""Objects of several materials in the engines: beams bend as in theory, masses add up, and pinned parts stay."""
 
 import json
 import logging
@@ -17,11 +17,11 @@ from stages.lab.assets.shapes import Surface, box, to_gaussians
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 
-G = 0.5  # [m/s^2]
+G = 0.5  # gravity [m/s^2]
 
 
 def roll(folder, surface: Surface, parts: list, **options) -> Trajectory:
-    """The motion of an object of several parts above a floor at z = 0; parts.ply has what is below z = .1 as "pot"."""
+    """The motion of an object of parts above a floor at z = 0; in parts.ply its points below z = 0.1 are "pot"."""
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
     write_scene(folder / "scene.ply", Scene(concatenate([g]), (SceneObject(1, "plant"),), None, 0.0))
     pot = replace(g, object_id=(g.means[:, 2] < 0.1).long())
@@ -33,9 +33,9 @@ def roll(folder, surface: Surface, parts: list, **options) -> Trajectory:
 
 
 def deflection(length: float, side: float, density: float, E: list[float], nu: float) -> float:
-    """Deflection of the tip of a clamped beam of square section under its own weight, in equal parts of moduli E.
+    """Deflection of the tip of a clamped beam of square section under its own weight; equal parts have moduli E.
 
-    Timoshenko's beam: bending M / E I integrated twice, and shear V / (k G A) with k = 5/6.
+    Timoshenko's beam theory: bending M / E I is integrated twice, shear is V / (k G A) with k = 5/6.
     """
     x = (torch.arange(2000, dtype=torch.float64) + 0.5) / 2000 * length
     modulus = torch.tensor(E, dtype=torch.float64)[(x / length * len(E)).long()]
@@ -57,13 +57,13 @@ def test_a_beam_bends_by_the_stiffness_of_its_parts(tmp_path, E):
     ], engine="mpm", gravity=G, steps=100, keypoints=256)  # fmt: skip
     x = t.keypoints.rest[:, 0]
     moved = t.positions[:, :, 2] - t.keypoints.rest[:, 2]
-    assert float(moved[:, x < -0.02].abs().max()) < 1e-3  # what is clamped stays
+    assert float(moved[:, x < -0.02].abs().max()) < 1e-3  # the clamped part stays
     tip_moved = -moved[:, x > length - 0.02].mean(1)
-    # two to three periods, weighted so that the oscillation about the static deflection cancels
+    # average over two to three periods, weighted so that the oscillation about the static deflection cancels
     window = torch.hann_window(len(tip_moved), periodic=False)
     measured = float((window * tip_moved).sum() / window.sum())
-    # the clamp is uncertain by half a cell of 15 mm, and the deflection goes with the fourth power of the length: 6 %;
-    # thickness, by half a voxel of 8 mm in 100, and the second power: 8 % the other way
+    # The position of the clamp has an error of half a cell of 15 mm; with the fourth power of the length this is 6 %.
+    # Half a voxel of 8 mm in the thickness of 100 mm, with the second power, is 8 % in the other direction.
     assert measured == pytest.approx(deflection(length, side, density, E, nu), rel=0.08)
 
 
@@ -77,7 +77,7 @@ def column() -> Surface:
 
 
 def masses(text: str) -> list[float]:
-    """Of the parts, or of the whole, as logged [kg]."""
+    """Masses of the parts, or of the whole, from the log [kg]."""
     return [float(m) for m in re.findall(r"\(plant\): custom, ([\d.]+) kg", text)]
 
 
@@ -86,11 +86,11 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
     even = {"material": {"E": 1e6, "density": 1000.0}}
     with caplog.at_level(logging.INFO):
         roll(tmp_path, column(), [POT | even, even], engine=engine, steps=1)
-        volume = sum(masses(caplog.text)) / 1000  # [m^3], to the voxels of the engine
+        volume = sum(masses(caplog.text)) / 1000  # [m^3], as filled by the voxels of the engine
         caplog.clear()
         t = roll(tmp_path, column(), [POT, STEM], engine=engine, steps=1)
     heavy, light = 1500 * volume / 3, 300 * volume * 2 / 3  # [kg]
-    # the border between the parts, at a third of the height, is moved by up to a voxel of 8 mm: 8 % of POT
+    # the border between the parts, at 1/3 of the height, is displaced by up to a voxel of 8 mm, or 8 % of POT
     assert sum(masses(caplog.text)) == pytest.approx(heavy + light, rel=0.08)
     assert ("the average of its parts" in caplog.text) == (engine != "mpm")
     if engine == "mpm":
@@ -102,7 +102,7 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
 @pytest.mark.parametrize(("engine", "pot"), [("mpm", POT), ("mpm", POT_BY_SEGMENT), ("rigid", POT_BY_SEGMENT),
                                              ("ngff", POT)])  # fmt: skip
 def test_what_is_pinned_stays(tmp_path, engine, pot, device):
-    """Pushed to the side for .1 s, the free part bends; engines of whole bodies hold all of it."""
+    """During a lateral push of 0.1 s the free part bends; engines of whole bodies hold the entire object."""
     stem = {"material": {"E": 3e4, "density": 300.0}}
     t = roll(tmp_path, column(), [pot | {"pinned": True}, stem], engine=engine, steps=6,
              force=("object=1 force=3,0,0 from=0 to=0.1",))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The MPM grid that follows its particles: against one fixed grid that is large enough for all of the motion."""
+"""The MPM grid that moves with its particles, compared with one fixed grid that contains all of the motion."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ OBJECTS = (SceneObject(1, "fast"), SceneObject(2, "slow"))
 
 
 def cube(at: tuple, velocity: tuple):
-    """27 particles of rubber, half a cell apart."""
+    """27 particles of rubber at intervals of half a cell."""
     x = torch.cartesian_prod(*[torch.arange(3) * DX / 2] * 3) + torch.tensor(at)
     particles = at_rest(x, (DX / 2) ** 3, ParticleMaterial(1e5, 0.3, 1000.0, 0.0, 0.0))
     particles.v[:] = torch.tensor(velocity)
@@ -26,7 +26,7 @@ def cube(at: tuple, velocity: tuple):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, sign):
-    """Two bodies that fly apart, upwards, with 5 and 2 m/s."""
+    """Two bodies fly apart and upwards, with 5 and 2 m/s."""
     particles = join_particles([cube((0.0, 0.0, 0.5), (4.0 * sign, 3.0 * sign, 2.0)), cube((0.3, 0, 0.5), (0, 0, 2.0))])
     body = torch.arange(2).repeat_interleave(27)
     small, large = Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2)), Box((-0.5 - 10 * BLOCK * DX,) * 2 + (0.0,), (3.0, 3.0, 3.0))
@@ -38,7 +38,7 @@ def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, sign):
         before, highest = moving.box, moving.solver.particles.x.amax(0).cpu()
         for grid in (moving, still):
             grid.advance(DT, torch.zeros(54, 3))
-        if moving.box != before:  # the frame that begins and ten more
+        if moving.box != before:  # room for the current frame and ten more
             room = MARGIN * DX + 11 * DT * 29**0.5
             torch.testing.assert_close(torch.tensor(moving.box.high) - highest, torch.full((3,), room))
         x = moving.solver.particles.x.cpu()
@@ -49,11 +49,11 @@ def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, sign):
     assert still.box == large and moving.box.low[2] == 0
     assert 2 <= len(boxes) <= 3
     moved = (torch.tensor(moving.box.low) - torch.tensor(small.low))[:2] / (BLOCK * DX)
-    torch.testing.assert_close(moved, moved.round(), rtol=0, atol=1e-3)  # on the same lattice
+    torch.testing.assert_close(moved, moved.round(), rtol=0, atol=1e-3)  # both grids use the same lattice
 
 
 def test_what_flies_away_is_the_object_farthest_from_the_others(device, monkeypatch, caplog):
-    """Not the one farthest from the origin."""
+    """It is not the one farthest from the origin."""
     monkeypatch.setattr(moving_grid.mpm, "max_contact_nodes", lambda device: 40_000)
     particles = join_particles([cube((x, 2.0, 0.5), (-v, 0.0, 0.0)) for x, v in ((2.0, 0), (0.8, 20), (2.3, 0))])
     objects = (*OBJECTS[1:], OBJECTS[0], SceneObject(3, "third"))
@@ -61,7 +61,7 @@ def test_what_flies_away_is_the_object_farthest_from_the_others(device, monkeypa
     moving = MovingGrid(particles, Box((0.4, 1.5, 0.0), (2.8, 2.5, 1.0)), DX, device, bodies, fixed=False)
     moving.advance(DT, torch.zeros(81, 3))
     assert "object 1 (fast) moves too far from the other objects" in caplog.text
-    assert moving.box.low == (0.4, 1.5, 0.0)  # and it stays there
+    assert moving.box.low == (0.4, 1.5, 0.0)  # the grid does not move
 
 
 def test_a_grid_for_many_bodies_begins_near_them_and_one_too_large_is_an_error(device, monkeypatch):
@@ -79,7 +79,7 @@ def test_a_grid_for_many_bodies_begins_near_them_and_one_too_large_is_an_error(d
 
 
 def test_frames_of_too_many_substeps_are_an_error_that_says_why(device):
-    """Those of a scene whose scale is wrong, and of a force that accelerates to nonsense."""
+    """Causes are a wrong scale of the scene, or a force that accelerates to unrealistic speeds."""
     particles, box = cube((0.0, 0.0, 0.5), (0.0, 0.0, 0.0)), Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2))
     bodies = GridBodies(torch.zeros(27, dtype=torch.int64), OBJECTS[:1])
     grid = MovingGrid(particles, box, DX, device, bodies, fixed=True)

@@ -1,4 +1,4 @@
-"""Options of `ngff simulate`: the limits of their values, and what follows from them."""
+"""Options of `ngff simulate`: limits of their values, and derived settings."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Measures of what goes wrong in a simulation, each for a motion made by hand."""
+"""Measures of errors in a simulation, each for a constructed motion."""
 
 import logging
 import math
@@ -25,14 +25,14 @@ DT, G = 0.02, 9.81
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Two cubes of side .2, one on the other."""
+    """Two cubes of side 0.2, one on top of the other."""
     cubes = [box((0.2,) * 3, 0.0125).moved((0.0, 0.0, z)) for z in (0.1, 0.3)]
     parts = [to_gaussians(c, torch.full((len(c.points), 3), 0.5), i + 1, widest=math.inf) for i, c in enumerate(cubes)]
     return Scene(concatenate(parts), (SceneObject(1, "lower"), SceneObject(2, "upper")), None, 0.0)
 
 
 def measured(scene: Scene, path, stretch=lambda t: 1.0, frames: int = 40) -> tuple[dict, PlausibilityMonitor]:
-    """Of a motion in which the upper cube is displaced by `path(t)` [m] and stretched about its centre."""
+    """Measures of a motion in which the upper cube is displaced by `path(t)` [m] and stretched about its centre."""
     keypoints = choose_keypoints(scene, 256)
     upper = keypoints.object_id == 2
     com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])
@@ -47,7 +47,7 @@ def measured(scene: Scene, path, stretch=lambda t: 1.0, frames: int = 40) -> tup
 
 
 def ramp(*end: float):
-    """A straight path to `end` in .1 s."""
+    """A straight path to `end` within 0.1 s."""
     return lambda t: tuple(min(t / 0.1, 1.0) * v for v in end)
 
 
@@ -68,7 +68,7 @@ def test_depth_of_penetration(scene, caplog):
 
 
 def test_a_dent_under_a_load_is_no_penetration(scene):
-    """The lower cube is compressed by a fifth, and the upper one comes down with its upper face; then .01 further."""
+    """The lower cube is compressed by 1/5 and the upper one moves down with its surface, and then 0.01 further."""
     keypoints = choose_keypoints(scene, 256)
     upper = keypoints.object_id == 2
     com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])
@@ -86,7 +86,7 @@ def test_a_dent_under_a_load_is_no_penetration(scene):
 
 
 def test_depth_in_the_height_of_a_flat_sheet_is_relative_to_a_voxel_of_it(scene):
-    """The lower cube, and a sheet on it that sinks in by .01."""
+    """A sheet lies on the lower cube and penetrates it by 0.01."""
     upper = scene.gaussians.object_id == 2
     means = scene.gaussians.means.clone()
     means[upper, 2] = 0.2
@@ -101,7 +101,7 @@ def test_depth_of_penetration_without_a_floor(scene):
 
 
 def test_overlap_by_a_lift_is_warned_of_and_not_counted(scene, caplog):
-    """The lower cube is lifted by .06 into the upper one, and sinks in by .03 more."""
+    """The lower cube is lifted by 0.06 into the upper one, and then penetrates by a further 0.03."""
     keypoints = choose_keypoints(scene, 256)
     lower = (keypoints.object_id == 1)[:, None]
     monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(lift={1: 0.06}), SimulateOptions())
@@ -118,7 +118,7 @@ def test_overlap_by_a_lift_is_warned_of_and_not_counted(scene, caplog):
 
 
 def test_bodies_end_at_the_floor(scene):
-    """The lower cube, below a floor in the middle of the upper one, rises into the lower half of that."""
+    """The lower cube is below a floor at half height of the upper one, and rises into the lower half of that."""
     keypoints = choose_keypoints(scene, 256)
     lower = (keypoints.object_id == 1)[:, None]
     com = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
@@ -144,7 +144,7 @@ def test_creep_spread_and_energy(scene, caplog):
     assert found["objects"]["2"]["creep"] == pytest.approx(0.1, rel=0.02) and found["objects"]["1"]["creep"] == 0
     found, _ = measured(scene, lambda t: (0.0, 0.0, 0.0), lambda t: 1 + 0.5 * t)
     assert found["objects"]["2"]["spread"] == pytest.approx(0.39, abs=0.01)
-    for speed, creeps in ((0.13, True), (0.15, False)):  # beside .1 sqrt(g size) = .14
+    for speed, creeps in ((0.13, True), (0.15, False)):  # the limit is 0.1 sqrt(g size) = 0.14
         found, _ = measured(scene, lambda t, speed=speed: (speed * t, 0.0, 0.0))
         assert found["objects"]["2"]["creep"] == pytest.approx(speed / 0.2 if creeps else 0.0, rel=0.02)
     fall = 0.2
@@ -159,7 +159,7 @@ def monitor_of(scene: Scene, prompts: ForcePrompts = ForcePrompts(), **options) 
 
 
 def test_energy_is_that_of_filled_bodies_and_of_their_deformation_weighted_by_mass(scene):
-    """The lower cube turns by .1 and moves, the upper one falls while its keypoints move apart."""
+    """The lower cube rotates by 0.1 rad and moves; the upper one falls while its keypoints move apart."""
     monitor = monitor_of(replace(scene, scale={"metres_per_unit": 0.5, "source": "stated"}), dt=0.1)
     com = np.array([[0.0, 0, 0.1], [0, 0, 0.3]])
     turn = Rotation.from_rotvec([[0.0, 0, 0.1], [0, 0, 0]]).as_matrix()
@@ -168,7 +168,7 @@ def test_energy_is_that_of_filled_bodies_and_of_their_deformation_weighted_by_ma
     apart = 0.03 * np.sign(np.arange(len(monitor._rest[1])) % 2 - 0.5)[:, None] * [0.0, 1, 0]
     moved = [x + (r - c) @ R.T for x, r, c, R in zip(after_com, monitor._rest, com, turn, strict=True)]
     before, after = (monitor._rest, com, np.stack([np.eye(3)] * 2)), ([moved[0], moved[1] + apart], after_com, turn)
-    g, square = G / 0.5, 2 * 0.1**2  # in units
+    g, square = G / 0.5, 2 * 0.1**2  # in scene units
     chord = (2 * math.sin(0.05)) ** 2
     first = (0.2**2 + chord * 0.2**2 / 6) / square + g * 0.1
     second = (0.1**2 + 0.03**2) / square + g * 0.25
@@ -190,7 +190,7 @@ def test_gain_of_energy_relative_to_what_was_converted(scene, energy, gain):
 
 
 def test_gain_of_energy_where_none_is_lost_is_relative_to_the_kinetic_energy(scene):
-    """As in free space, where its rounding would else be divided by next to nothing."""
+    """In free space, for example, rounding would otherwise be divided by almost zero."""
     monitor = monitor_of(scene, gravity=0.0)
     monitor._energy = [(2.0, 0.0), (2.02, 0.0), (2.5, 0.0)]
     assert monitor._energy_gain() == pytest.approx(0.2)
@@ -211,7 +211,7 @@ def test_gain_of_energy_counts_from_the_last_force(scene, end, gain):
 
 
 def test_depth_below_the_surface_of_a_cube(scene):
-    """Linear towards the nearest face, negative outside."""
+    """The depth is linear towards the nearest face, and negative outside."""
     surface = monitor_of(scene)._surface(0)
     depth = surface.depth
     x = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, -0.08, 0.1], [0.1, 0.0, 0.1], [0.15, 0.0, 0.1]])
@@ -222,7 +222,7 @@ def test_depth_below_the_surface_of_a_cube(scene):
 
 
 def test_a_body_that_has_turned_is_measured_where_it_is(scene):
-    """Beside the lower cube, .03 in common with its corner; turned by 45 degrees about z it has a side there."""
+    """The corner of the lower cube overlaps by 0.03; after rotation by 45 degrees about z, it has a side there."""
     keypoints = choose_keypoints(scene, 256)
     upper = keypoints.object_id == 2
     com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])

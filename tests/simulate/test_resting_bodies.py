@@ -1,4 +1,4 @@
-"""Bodies at rest in photos: what slides, lifts and tips them, and what falls with what is taken away."""
+"""Bodies at rest in photos: conditions for sliding, lifting and tipping, and for falling after losing support."""
 
 import math
 from dataclasses import replace
@@ -15,14 +15,14 @@ HEIGHT, HALF_WIDTH = 0.5, 0.3
 
 
 def stance(friction: float, height: float, half_width: float, box: tuple) -> Stance:
-    """Of a box of half sides (half, half, half) at (x, y, z)."""
+    """Stance of a box of half sides (half, half, half) at (x, y, z)."""
     *centre, half = box
     return Stance(friction, height, half_width, math.isclose(centre[2], half), np.array(centre) - half,
                   np.array(centre) + half)  # fmt: skip
 
 
 def world(boxes: list[tuple], stances: list[Stance] | None = None):
-    """Boxes of half sides (half, half, half) at (x, y, z), above a plane at z = 0, all of them at rest."""
+    """Boxes of half sides (half, half, half) at (x, y, z) above a plane at z = 0, all at rest."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = STEP, [0, 0, -G]
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
@@ -39,7 +39,7 @@ def world(boxes: list[tuple], stances: list[Stance] | None = None):
 
 
 def steps_until_released(wrench: tuple, friction: float, most: int = 300) -> int | None:
-    """Substeps under contact forces and moments about the centre of mass until a body is released; None for never."""
+    """Substeps with contact forces and moments about the centre of mass until a body is released, or None."""
     _, data, resting = world([(0, 0, 0.5, 0.5)], [stance(friction, HEIGHT, HALF_WIDTH, (0, 0, 0.5, 0.5))])
     for n in range(1, most + 1):
         data.qfrc_constraint[:6] = wrench
@@ -49,16 +49,16 @@ def steps_until_released(wrench: tuple, friction: float, most: int = 300) -> int
 
 
 def steps_of(excess: float) -> int:
-    """Substeps in which this force gives the body the speed at which it is released."""
+    """Substeps in which this force accelerates the body to the speed at which it is released."""
     return math.floor(MASS * RELEASE_SPEED / (excess * STEP)) + 1
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
 def test_a_push_slides_a_body_when_it_exceeds_friction(turn):
-    """In any direction, and with what lifts the body taken off its weight."""
+    """The direction does not matter, and lifting forces are subtracted from the weight."""
 
     def push(force, lift=0.0):
-        # at the base, where it does not tip the body
+        # at the base, so that the body does not tip
         x, y = force * math.cos(turn), force * math.sin(turn)
         return x, y, lift, HEIGHT * y, -HEIGHT * x, 0.0
 
@@ -75,7 +75,7 @@ def test_a_body_is_lifted_by_more_than_its_weight():
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
 @pytest.mark.parametrize("above", [0.0, 0.5])
 def test_a_push_tips_a_body_by_its_moment_about_the_base(turn, above):
-    """At a height `above` the centre of mass; friction holds."""
+    """The push is at a height `above` the centre of mass; friction prevents sliding."""
     tips = WEIGHT * HALF_WIDTH / (HEIGHT + above)
     for share, expected in ((0.98, None), (1.5, steps_of(0.5 * WEIGHT * HALF_WIDTH / HEIGHT))):
         x, y = share * tips * math.cos(turn), share * tips * math.sin(turn)
@@ -93,11 +93,11 @@ def test_a_short_disturbance_is_forgotten():
 
 
 def test_what_rests_on_a_released_body_is_released_with_it():
-    """In any order of the bodies: a tower of three, a box that touches it from the side, and one in the air."""
+    """Independent of the order of the bodies: a tower of three, a box touching it from the side, and one in the air."""
     tower = [(0, 0, 0.5, 0.1), (0, 0, 0.3, 0.1), (0, 0, 0.1, 0.1)]
     beside, floating = (0.2, 0, 0.105, 0.1), (2.0, 0, 0.5, 0.1)
     _, _, resting = world([*tower, beside, floating])
-    assert resting.held.all()  # what touches nothing too: its support is not seen
+    assert resting.held.all()  # those without contact are held too, because their support is not visible
     assert resting.resting_on == {3: {2}, 2: {1}}
     assert sorted(resting.release([2])) == [1, 2] and resting.held.tolist() == [False, False, True, True, True]
     assert resting.release([2]) == [] and sorted(resting.release([3])) == [3]
@@ -106,7 +106,7 @@ def test_what_rests_on_a_released_body_is_released_with_it():
 
 
 def test_what_leans_on_a_released_body_is_released_with_it():
-    """Three boxes beside each other on the floor, of which the middle one leans, or the last two on each other."""
+    """Three boxes beside each other on the floor; the middle one leans, or the last two lean on each other."""
     boxes = [(0.0, 0, 0.1, 0.1), (0.205, 0, 0.1, 0.1), (0.41, 0, 0.1, 0.1)]
     stances = [stance(0.5, 0.1, 0.1, b) for b in boxes]
     _, _, resting = world(boxes, [stances[0], replace(stances[1], leaning=True), stances[2]])
@@ -117,7 +117,7 @@ def test_what_leans_on_a_released_body_is_released_with_it():
 
 @pytest.mark.parametrize(("degrees", "leaning"), [(0, False), (20, True), (50, True), (80, True), (90, False)])
 def test_a_board_leans_unless_it_stands_or_lies(degrees, leaning):
-    """Of .5 x .15 x .06, turned by these degrees from where it lies: on its end it stands."""
+    """A board of 0.5 x 0.15 x 0.06 is rotated by an angle from lying; at 90 degrees it stands on its end."""
     x, y, z = np.meshgrid(*(np.array([-0.5, 0.5]) * side for side in (0.5, 0.15, 0.06)))
     corners, a = np.stack([x, y, z], -1).reshape(-1, 3), math.radians(degrees)
     turn = np.array([[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]])

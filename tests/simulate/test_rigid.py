@@ -1,4 +1,4 @@
-"""The rigid engine: free fall, friction, restitution, stacks, prompts and scale, each against its analytic value."""
+"""The rigid engine: free fall, friction, restitution, stacks, prompts and scale, compared with analytic values."""
 
 import json
 import logging
@@ -38,14 +38,14 @@ G = 9.81
 
 @pytest.fixture(autouse=True)
 def small_bodies(monkeypatch):
-    """Few particles, which decide on whether a body stands on the floor, and bodies half as fine as usual."""
+    """Use few particles, which only decide whether a body stands on the floor, and bodies of half the resolution."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
     monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
 
 
 @pytest.fixture
 def usual_bodies(small_bodies, monkeypatch):
-    """As fine as usual, for contacts of bodies whose parts are thin; of surfaces that no other test has."""
+    """Use bodies of full resolution, for contacts of thin parts; other tests must not use the same surfaces."""
     monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 48)
 
 
@@ -59,7 +59,7 @@ PHOTOS = {"command": "segment", "scene": {"command": "reconstruct"}}
 
 @cache
 def scene_of(surfaces: tuple[Surface, ...], unit: float = 1.0, photos: bool = False) -> Scene:
-    """One object for each surface; surfaces are told apart by identity."""
+    """One object for each surface; cached, because Surface is hashed by identity."""
     grey = [torch.full((len(s.points), 3), 0.5) for s in surfaces]
     parts = [to_gaussians(s, grey[i], i + 1, widest=math.inf) for i, s in enumerate(surfaces)]
     objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
@@ -80,13 +80,13 @@ def roll(folder: Path, *surfaces: Surface, unit: float = 1.0, photos: bool = Fal
 
 
 def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(tmp_path):
-    """By the command."""
+    """Run as a stage, from file to file."""
     scene = scene_of((cube(0.1, 0, 0.5),))
     write_scene(tmp_path / "scene.ply", scene)
     run(tmp_path / "scene.ply", tmp_path / "t.h5", options_of(scene, tmp_path, steps=11))
     t = read_trajectory(tmp_path / "t.h5")
     assert torch.equal(t.positions[0], t.keypoints.rest) and t.info.engine == "rigid"
-    # semi-implicit Euler falls g t dt / 2 further; the substep is below 1 ms
+    # semi-implicit Euler adds g t dt / 2 to the fall; the substep is less than 1 ms
     assert float(t.com[-1, 0, 2] - t.com[0, 0, 2]) == pytest.approx(-G * 0.2**2 / 2, rel=0.01)
 
 
@@ -107,15 +107,15 @@ def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
     z = t.com[:, 0, 2] - 0.1
     hit = int((z < 0.02).nonzero()[0])
     rebound = math.sqrt(float(z[hit:].max()) / 0.5)
-    assert rebound == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
+    assert rebound == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation with low damping
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.002])
 @pytest.mark.parametrize("loss", [0.001, 0.15])
 def test_the_last_of_a_row_of_balls_flies_off(tmp_path, gap, loss):
-    """Newton's cradle: each ball passes (1 + e) / 2 of its speed on, also where they touch.
+    """Newton's cradle: each ball transfers (1 + e) / 2 of its speed, even if the balls touch initially.
 
-    The others are together then, but for what pushes balls apart that were inside each other at the impact.
+    The other balls then stay together, except for the small speed that separates balls that overlap after the impact.
     """
     row = [BALL.moved((i * (0.2 + gap) - 0.1 * (i == 0), 0.0, 0.0)) for i in range(4)]
     t = roll(tmp_path, *row, velocity=("object=1 1,0,0",), friction=0.0, loss=loss, dt=0.01, steps=31)
@@ -128,15 +128,15 @@ def test_the_last_of_a_row_of_balls_flies_off(tmp_path, gap, loss):
 
 @pytest.mark.parametrize(("name", "share"), [("steel", 0.597), ("glass", 0.658), ("wood", 0.603), ("plastic", 0.688)])
 def test_stiff_solids_rebound_as_measured(name, share):
-    """Balls dropped from .92 m (The Physics Factbook, Coefficients of restitution)."""
+    """Balls were dropped from 0.92 m (The Physics Factbook, Coefficients of restitution)."""
     assert restitution(MATERIALS[name].loss) == pytest.approx(share, abs=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_ball_that_slid_rolls_on_and_is_slowed_by_the_loss_of_its_material_alone(tmp_path, noise):
-    """Once 5/7 of the speed are left it rolls (inertia 2/5 m r^2); then it slows down by 5/7 g arm / r.
+    """At 5/7 of its speed it rolls (inertia 2/5 m r^2); then its deceleration is 5/7 g arm / r.
 
-    So does one with a noisy surface, as of a reconstruction.
+    The same applies to a ball with a noisy surface, as in a reconstruction.
     """
     stretch = 1 + noise * torch.randn(len(BALL.points), 1, generator=torch.Generator().manual_seed(0))
     middle = torch.tensor([0.0, 0.0, 0.1])
@@ -153,16 +153,17 @@ def test_a_ball_that_slid_rolls_on_and_is_slowed_by_the_loss_of_its_material_alo
 
 @cache
 def random_cylinder(axes: tuple[int, int, int]) -> Surface:
-    """Of radius .1 and length .3 along the axis that comes last, on the floor, as points at random."""
+    """Random points on a cylinder of radius 0.1 on the floor, of length 0.3 along the axis given last."""
     points = torch.from_numpy(0.1 * cylinder(3.0)[:, np.argsort(axes)]).float()
-    out = torch.nn.functional.normalize(points, dim=1)  # about, which decides on the Gaussians' flat side alone
+    # approximate normals, which only determine the flat side of the Gaussians
+    out = torch.nn.functional.normalize(points, dim=1)
     return Surface(points - points.amin(0) * torch.tensor([0.0, 0.0, 1.0]), out)
 
 
 def test_a_cylinder_that_slid_rolls_on_and_is_slowed_by_the_loss_of_its_material_alone(tmp_path):
-    """Once 2/3 of the speed are left it rolls (inertia m r^2 / 2); then it slows down by 2/3 g arm / r.
+    """At 2/3 of its speed it rolls (inertia m r^2 / 2); then its deceleration is 2/3 g arm / r.
 
-    The polygon of 200 points that it was had lost half of that in 2 s.
+    As a polygon of 200 points, it would lose half of that speed in 2 s.
     """
     t = roll(
         tmp_path,
@@ -190,7 +191,7 @@ def test_a_cylinder_stands_on_its_end(tmp_path):
 
 
 def test_a_tray_that_stood_on_the_floor_has_an_underside_that_falls_on_a_ball(tmp_path):
-    """It is lifted from over a small ball and let fall: the ball must not enter it, of which it is in the middle."""
+    """It is lifted from above a small ball and dropped; the ball is in its hollow and must not penetrate it."""
     parts = [((0.3, 0.3, 0.03), (0, 0, 0.015)), *(((0.03, 0.3, 0.12), (x, 0, 0.06)) for x in (-0.135, 0.135))]
     ball = ellipsoid((0.05,) * 3, 1500).moved((0.0, 0.0, 0.05))
     t = roll(tmp_path, compound(0.012, *parts), ball, lift=("1=.3",), loss=0.6, steps=20)
@@ -199,7 +200,7 @@ def test_a_tray_that_stood_on_the_floor_has_an_underside_that_falls_on_a_ball(tm
 
 
 def test_a_lid_on_a_block_stays_level(tmp_path):
-    """It touches the block with the inside of its top: edges of the block are no overlap at the start."""
+    """The inside of its top touches the block; edges of the block must not count as initial overlap."""
     sides = [((0.015, 0.3, 0.1), (x, 0, 0.05)) for x in (-0.1425, 0.1425)]
     sides += [((0.3, 0.015, 0.1), (0, y, 0.05)) for y in (-0.1425, 0.1425)]
     lid = compound(0.007, ((0.3, 0.3, 0.015), (0, 0, 0.0925)), *sides).moved((0.0, 0.0, 0.035))
@@ -210,16 +211,17 @@ def test_a_lid_on_a_block_stays_level(tmp_path):
 
 
 def test_a_heavy_box_that_falls_on_a_card_lies_on_it(tmp_path):
-    """On 2 mm that weigh 1/160 of it: the card would need hundreds of impacts on box and floor to stop the box."""
+    """The card of 2 mm has 1/160 of the mass; it would need hundreds of impacts on box and floor to stop the box."""
     card = box((0.09, 0.06, 0.002), 0.003).moved((0.0, 0.0, 0.001))
     t = roll(tmp_path, card, cube(0.12, 0.02, 0.022), steps=40)
     low = (t.positions[-1, t.keypoints.object_id == 2, 2]).min()
-    assert float(low) == pytest.approx(0.002, abs=3e-4)  # a thousandth of the card's length, and points of surfaces
+    # the tolerance is for 1/1000 of the card's length, and for points of surfaces
+    assert float(low) == pytest.approx(0.002, abs=3e-4)
     assert float(t.positions[:, t.keypoints.object_id == 1, 2].min()) > -3e-4
 
 
 def test_a_fall_of_half_a_percent_of_the_size_ends_without_a_rebound(tmp_path):
-    """Also of a material that loses nothing: it would bounce for seconds."""
+    """Even a material without loss must not bounce, which would last for seconds."""
     t = roll(tmp_path, FLAT, lift=("0.001",), loss=0.0, dt=0.005, steps=24)
     assert float((t.com[8:, 0, 2] - t.com[-1, 0, 2]).abs().max()) < 2e-6
     assert float(t.com[-1, 0, 2] - t.com[0, 0, 2]) == pytest.approx(-0.001, abs=1e-4)
@@ -231,7 +233,7 @@ def test_a_tower_stands(tmp_path):
 
 
 def test_overlaps_at_the_start_remain_without_a_jump(tmp_path):
-    """The upper of two cubes stays in the lower one by as much as it was; nothing is pushed apart."""
+    """The upper of two cubes keeps its initial overlap with the lower one; they are not pushed apart."""
     t = roll(tmp_path, cube(0.1, 0, 0.0), cube(0.1, 0, 0.08), steps=20)
     assert torch.equal(t.positions[0], t.keypoints.rest)
     assert float((t.com - t.com[0]).norm(dim=-1).max()) < 2e-3
@@ -244,17 +246,17 @@ def test_what_was_lifted_out_of_an_overlap_does_not_sink_in_again(tmp_path):
 
 
 def test_objects_of_photos_rest_until_something_disturbs_them(tmp_path):
-    """A leaning or stacked thing stays; the upper of two falls once the lower one is taken away."""
+    """A stacked object stays, although it would tip; it falls after the lower one is removed."""
     lower, upper, far = cube(0.1, 0, 0.0), cube(0.1, 0.06, 0.1), cube(0.1, 0.5, 0.0)
     still = roll(tmp_path, lower, upper, far, steps=10, photos=True)
-    assert torch.equal(still.positions[-1], still.positions[0])  # the upper one would tip
+    assert torch.equal(still.positions[-1], still.positions[0])  # otherwise the upper one would tip
     t = roll(tmp_path, lower, upper, far, steps=30, photos=True, velocity=("object=1 0,3,0",))
     moved = (t.com[-1] - t.com[0]).norm(dim=1)
     assert moved[2] == 0 and moved[0] > 0.2 and float(t.com[-1, 1, 2] - t.com[0, 1, 2]) < -0.05
 
 
 def test_what_does_not_move_is_written_without_rounding(tmp_path):
-    """So that it is rendered as it is, without being skinned and shaded; beside what moves, and lifted."""
+    """It is then rendered without skinning and shading; another object moves, and this one is lifted."""
     prompts = {"velocity": ("object=1 0,1,0",), "lift": ("2=.1",), "pin": ("2",)}
     t = roll(tmp_path, cube(0.1, 0.37, 0.0), cube(0.1, -0.71, 0.0), unit=0.3, steps=10, photos=True, **prompts)
     still, lift = t.keypoints.object_id == 2, torch.tensor([0.0, 0.0, 0.1])
@@ -274,7 +276,7 @@ def test_contacts_are_found_once_something_moves(tmp_path, monkeypatch):
 
 
 def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
-    """Photos show things at rest: the support is not seen. The upper cube falls once the one below it is taken away."""
+    """Objects of photos are at rest with an invisible support. The upper cube falls after the lower one is removed."""
     cubes = cube(0.1, 0.02, 0.15), cube(0.1, 0, 0.0), cube(0.1, -0.3, 0.15)
     still = roll(tmp_path, *cubes, steps=10, photos=True)
     assert torch.equal(still.positions[-1], still.positions[0])
@@ -294,7 +296,7 @@ def test_a_board_that_leans_on_an_object_in_photos_falls_once_that_is_taken_away
 
 
 def test_objects_of_films_and_with_no_rest_fall_from_where_they_are(tmp_path):
-    """By half of .15, in .124 s, or the rest until the floor."""
+    """Within 0.12 s, the cube falls by half of its height of 0.15 above the floor."""
     hanging = cube(0.1, 0, 0.15)
     still, free = (roll(tmp_path, hanging, steps=7, photos=True, rest=rest) for rest in (True, False))
     assert torch.equal(still.positions[-1], still.positions[0])
@@ -323,7 +325,7 @@ def test_a_body_that_is_not_convex_slides_by_v2_over_2_mu_g(tmp_path):
 
 
 def test_a_body_that_is_not_convex_slides_on_without_friction(tmp_path):
-    """On the floor, and a box on it."""
+    """One slides on the floor, with a box on it."""
     low = cross().moved((0, 0, 0.025))
     t = roll(tmp_path, low, cube(0.04, 0, 0.05), velocity=("object=1 1,0,0", "object=2 1,0,0"), friction=0.0, steps=20)
     moved = t.com[-1] - t.com[0]
@@ -333,7 +335,7 @@ def test_a_body_that_is_not_convex_slides_on_without_friction(tmp_path):
 
 @pytest.mark.usefixtures("usual_bodies")
 def test_bodies_that_are_not_convex_rebound_by_their_loss_factor(tmp_path):
-    """A cross that falls flat onto a pinned one; speeds are those of parabolas before and after the impact."""
+    """A cross falls flat onto a pinned one; speeds are computed from the parabolas before and after the impact."""
     lower, upper = cross().moved((0, 0, 0.025)), cross().moved((0, 0, 0.2))
     t = roll(tmp_path, lower, upper, loss=0.1, pin=("1",), dt=0.01, steps=30)
     z = t.com[:, 1, 2].double()
@@ -343,15 +345,15 @@ def test_bodies_that_are_not_convex_rebound_by_their_loss_factor(tmp_path):
 
 
 def energy_between_frames(t: Motion, dt: float) -> torch.Tensor:
-    """Of a kilogram in the keypoints [J], from differences of frames, and so too little in those of an impact."""
+    """Energy per mass of the keypoints [J/kg], from differences of frames; too small for frames with an impact."""
     x = t.positions.double()
     return ((x[1:] - x[:-1]) ** 2).sum(-1).mean(1) / (2 * dt**2) + G * ((x[1:] + x[:-1]) / 2)[..., 2].mean(1)
 
 
 def test_a_body_that_is_not_convex_gains_no_energy_on_the_floor(tmp_path):
-    """Springs of contacts that come and go during a collision would make a tumbling cross bounce ever higher.
+    """Contact springs that appear and disappear during a collision could make a tumbling cross bounce ever higher.
 
-    It turns freely, so that the energy of its keypoints, which are not its mass, varies by a tenth between impacts.
+    Between impacts, the energy of the keypoints of a rotating cross varies by 10 %, because they are not its mass.
     """
     t = roll(tmp_path, cross().moved((0, 0, 0.5)), loss=0.1, steps=400, dt=0.005, velocity=("object=1 1,0,0",),
              force=("object=1 force=0,0,0 torque=.3,.2,0 to=0.04",))  # fmt: skip
@@ -363,7 +365,7 @@ def test_a_body_that_is_not_convex_gains_no_energy_on_the_floor(tmp_path):
 
 @pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.5])
 def test_force_torque_and_pin(tmp_path, unit):
-    """Newtons and newton metres in scenes of any scale; velocities and places are in scene units."""
+    """Forces are in newtons and torques in newton metres at any scale; velocities and positions are in scene units."""
     boxes = cube(0.2, 0, 0.5), cube(0.2, 1, 0.5)
     mass = 500 * (0.2 * unit) ** 3
     inertia = mass * (0.2 * unit) ** 2 / 6
@@ -371,8 +373,8 @@ def test_force_torque_and_pin(tmp_path, unit):
         f"object=1 force={mass},0,0 torque=0,0,{inertia} to=0.1", "object=2 force=9,9,9"))  # fmt: skip
     assert torch.equal(t.com[-1, 1], t.com[0, 1])
     assert float((t.com[-1] - t.com[-2])[0, 0] / 0.02) == pytest.approx(0.1 / unit, rel=0.02)
-    assert turning(t) == pytest.approx(0.1, rel=0.03)  # edges between points are cut
-    # a push at half a side from the centre: as its torque
+    assert turning(t) == pytest.approx(0.1, rel=0.03)  # edges between the points are cut off
+    # a push at half a side from the centre acts like its torque
     hit = roll(tmp_path, *boxes, gravity=0.0, pin=("2",), steps=8, unit=unit,
                force=(f"object=1 force=0,{mass},0 at=0.1,0,0.6 to=0.1",))  # fmt: skip
     assert turning(hit) == pytest.approx(mass * 0.1 * unit / inertia * 0.1, rel=0.03)
@@ -386,13 +388,13 @@ def turning(t: Motion) -> float:
 
 
 def test_a_box_is_slowed_by_the_friction_of_its_material_at_any_scale(tmp_path):
-    """v^2 / 2 mu g with mu = .3, in metres, of a box that starts with 1 m/s; one unit is 5 m."""
+    """A box of initially 1 m/s slides by v^2 / 2 mu g, in metres, with mu = 0.3; one unit is 5 m."""
     t = roll(tmp_path, FLAT, velocity=("object=1 .2,0,0",), unit=5.0, steps=25)
     assert 5 * float(t.com[-1, 0, 0]) == pytest.approx(1 / (2 * 0.3 * G), rel=0.04)
 
 
 def test_motion_is_the_same_at_any_size(tmp_path):
-    """A cube slides, and another bounces: motions that rounding does not change."""
+    """One cube slides, and another bounces; rounding does not influence these motions."""
     one, *others = (
         roll(tmp_path, cube(0.2 * s, 0, 0), cube(0.1 * s, -0.5 * s, 0.2 * s), steps=25, dt=0.02 * math.sqrt(s),
              velocity=(f"object=1 {math.sqrt(s)},0,0",)).com / s
@@ -418,7 +420,7 @@ def test_motion_without_limit_is_an_error(tmp_path):
         roll(tmp_path, cube(0.1, 0, 0.5), force=("object=1 force=9e8,0,0",), steps=9, dt=0.5)
 
 
-SUBSTEPS_OF_A_CUBE = [  # of side .1 m and .5 kg on the floor: sqrt(size / acceleration) / 200, or .05 size / speed
+SUBSTEPS_OF_A_CUBE = [  # sqrt(size / acceleration) / 200 or 0.05 size / speed, for 0.1 m and 0.5 kg on the floor
     ({}, 39.6), ({"gravity": 4 * G}, 79.2), ({"gravity": 0.0}, 1), ({"velocity": ("object=1 12,0,5",)}, 57.6),
     ({"force": ("object=1 force=30,40,0",)}, 126.5), ({"force": ("object=1 torque=0,0.6,0.8",)}, 56.6),
     ({"force": ("object=1 force=30,40,0 from=0 to=0.01",)}, 39.6), ({"unit": 0.25}, 79.2),
@@ -450,21 +452,21 @@ def test_the_fastest_object_decides_on_the_substeps(tmp_path, caplog):
 
 
 def test_an_object_below_the_floor_keeps_its_body_and_returns_to_where_it_stood(tmp_path, caplog):
-    """A bar upright on the ground beside a table, lifted by half its height; what stands on the table does not fall.
+    """A bar stands on the ground beside a table and is lifted by half its height; objects on the table do not fall.
 
-    One of these is not convex.
+    One of these objects is not convex.
     """
     caplog.set_level(logging.INFO)
     bar = box((0.1, 0.1, 0.3), 0.02).moved((0.3, 0.0, -0.25))
     t = roll(tmp_path, bar, cube(0.1, 0, 0.0), cross().moved((0.0, 0.5, 0.025)), lift=("1=0.15",), steps=40)
-    assert any("(40 per frame)" in r.getMessage() for r in caplog.records)  # of the cube's size
+    assert any("(40 per frame)" in r.getMessage() for r in caplog.records)  # as follows from the size of the cube
     assert float(t.com[0, 0, 2]) == pytest.approx(-0.1, abs=1e-3)
     assert float((t.com[-1, 0] - t.com[0, 0] + torch.tensor([0.0, 0.0, 0.15])).norm()) < 2e-3
     assert float(t.com[:, 0, 2].max()) < -0.1 + 1e-4 and float((t.com[-1, 1:] - t.com[0, 1:]).norm()) < 1e-3
 
 
 def rail() -> Surface:
-    """A bar that is not convex along x, 1.2 x .2 x .04, with a rim at its left end; its top is at 0."""
+    """A non-convex bar along x of 1.2 x 0.2 x 0.04, with a rim at its left end; its top is at 0."""
     pieces = ((1.2, 0.2, 0.04), (0.0, 0.0, -0.02)), ((0.04, 0.2, 0.1), (-0.58, 0.0, 0.01))
     return union(*((box(sides, 0.01).moved(at), partial(strictly_inside, sides=sides, at=at)) for sides, at in pieces))
 
@@ -474,7 +476,7 @@ def strictly_inside(points: torch.Tensor, sides: tuple, at: tuple) -> torch.Tens
 
 
 def test_a_ball_rests_on_a_body_that_is_not_convex_whatever_sticks_out_of_its_surface(tmp_path):
-    """A tuft of .08 radii points downwards, on which it would tip over."""
+    """A tuft of 0.08 radii at the bottom of the ball could tip it over."""
     below = BALL.points[:, 2] < 0.002
     points = BALL.points.clone()
     points[below, 2] -= 0.008
@@ -494,7 +496,7 @@ def test_bodies_that_are_not_convex_slide_on_each_other_by_v2_over_2_mu_g(tmp_pa
 
 @pytest.mark.parametrize("friction", [0.3, pytest.param(0.9, marks=pytest.mark.slow)])
 def test_a_force_a_little_beyond_friction_accelerates_a_box_by_the_difference(tmp_path, friction):
-    """Contacts that push a sliding body up would let it slide faster. Its mass is measured without friction."""
+    """If contacts lifted a sliding body, it would slide faster. Its mass is measured without friction."""
     free = roll(tmp_path, FLAT, friction=0.0, force=("object=1 force=1,0,0",), steps=31)
     mass = 0.6**2 / 2 / float(free.com[-1, 0, 0] - free.com[0, 0, 0])
     t = roll(tmp_path, FLAT, friction=friction, force=(f"object=1 force={mass * G * (friction + 0.03)},0,0",), steps=31)
@@ -502,7 +504,7 @@ def test_a_force_a_little_beyond_friction_accelerates_a_box_by_the_difference(tm
 
 
 def spins(rotation: torch.Tensor, dt: float) -> torch.Tensor:
-    """Angular velocities (t - 1, 3) between frames (t, 4), in the frame of the body, below half a turn a frame."""
+    """Angular velocities (t - 1, 3) between frames (t, 4) in the body's frame, for less than half a turn per frame."""
     R = matrix(rotation.double())
     turn = R[:-1].mT @ R[1:]
     axis = torch.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
@@ -511,9 +513,9 @@ def spins(rotation: torch.Tensor, dt: float) -> torch.Tensor:
 
 
 def test_friction_adds_no_energy_to_tumbling_bodies(tmp_path):
-    """Two crosses meet and tumble on a floor of friction 1, where sliding contacts must not push bodies up.
+    """Two crosses collide and tumble on a floor of friction 1, where sliding contacts must not lift bodies.
 
-    A frame is a substep, so that differences of frames are velocities.
+    A frame has one substep, so that differences of frames are velocities.
     """
     dt, bodies = 0.0005, (cross().moved((-0.3, 0, 0.3)), cross().moved((0.3, 0.05, 0.3)))
     velocity = ("object=1 3,0,0", "object=2 -3,0,0")
@@ -529,9 +531,9 @@ def test_friction_adds_no_energy_to_tumbling_bodies(tmp_path):
 
 
 def test_a_body_that_tumbles_in_free_space_keeps_its_energy(tmp_path):
-    """About its middle axis of inertia, so that it turns over again and again, for 3 s at 10 rad/s."""
+    """It rotates about its middle axis of inertia and thus turns over repeatedly, for 3 s at 10 rad/s."""
     brick, dt = box((0.3, 0.2, 0.1), 0.02).moved((0.0, 0.0, 1.0)), 0.02
-    moments = torch.tensor([0.2**2 + 0.1**2, 0.3**2 + 0.1**2, 0.3**2 + 0.2**2]) / 12  # per mass
+    moments = torch.tensor([0.2**2 + 0.1**2, 0.3**2 + 0.1**2, 0.3**2 + 0.2**2]) / 12  # moments of inertia per mass
     torque = 500 * 0.3 * 0.2 * 0.1 / dt * moments * torch.tensor([0.5, 10.0, 0.0])
     push = "object=1 from=0 to={} torque={},{},{}".format(dt, *torque.tolist())
     t = roll(tmp_path, brick, gravity=0.0, dt=dt, steps=152, force=(push,))
@@ -542,7 +544,7 @@ def test_a_body_that_tumbles_in_free_space_keeps_its_energy(tmp_path):
 
 
 def test_a_body_that_spins_by_two_radians_in_a_substep_keeps_its_axis(tmp_path):
-    """As slender ones do that roll; it also turns at 1 rad/s about another axis, and so nutates by 3 degrees."""
+    """Rolling slender bodies spin this fast. It also rotates at 1 rad/s about another axis and nutates by 3 degrees."""
     bar, dt = box((0.3, 0.1, 0.1), 0.01).moved((0.0, 0.0, 1.0)), 0.02
     torque = 500 * 0.3 * 0.1 * 0.1 / 12 / dt * np.array([100 * 0.02, 1 * 0.1])
     push = f"object=1 from=0 to={dt} torque={torque[0]},{torque[1]},0"
@@ -551,7 +553,7 @@ def test_a_body_that_spins_by_two_radians_in_a_substep_keeps_its_axis(tmp_path):
 
 
 def test_a_dropped_body_that_is_not_convex_rests_when_its_rebounds_are_over(tmp_path):
-    """Rebounds of restitution e after a fall of time T last T (1 + e) / (1 - e) in all."""
+    """With restitution e, the rebounds after a fall of time T last T (1 + e) / (1 - e) in total."""
     e, fall = math.exp(-math.pi * 0.4 / 2), math.sqrt(2 * 0.1 / G)
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), lift=("1=0.1",), loss=0.4, dt=0.01, steps=60)
     last = math.ceil(fall * (1 + e) / (1 - e) / 0.01)
@@ -559,7 +561,7 @@ def test_a_dropped_body_that_is_not_convex_rests_when_its_rebounds_are_over(tmp_
 
 
 def contacts_at(speed: list[float], distance: list[float]) -> SimpleNamespace:
-    """MuJoCo's data of contacts of geometries 0 and 1 with a normal speed, a slip of (1, -2) and a distance each."""
+    """MuJoCo's data for contacts of geometries 0 and 1 with normal speeds, distances and a slip of (1, -2)."""
     n = len(speed)
     velocity = np.stack([np.array(speed), np.ones(n), np.full(n, -2.0)], 1).ravel()
     contact = SimpleNamespace(efc_address=3 * np.arange(n), friction=np.full((n, 5), 0.4), geom=np.array([[0, 1]] * n))
@@ -568,7 +570,7 @@ def contacts_at(speed: list[float], distance: list[float]) -> SimpleNamespace:
 
 
 def test_fast_contacts_rebound_within_a_substep_and_slow_ones_are_pushed_apart():
-    """Deep ones at the speed below which nothing rebounds, however deep; slip ends at once."""
+    """Deep contacts are separated at no more than the speed below which there is no rebound; slip ends immediately."""
     v = REST_SPEED
     data = contacts_at([-v, 0.0, v, v, -10 * v, -1.5 * v], [-d for d in (0.0, 1e-5, 1.0, 5.0, 0.0, 0.0)])
     normal, friction, rebounds = set_references(data, 0.01, np.array([1.0, 0.6]), np.zeros(18))
@@ -582,7 +584,7 @@ def test_fast_contacts_rebound_within_a_substep_and_slow_ones_are_pushed_apart()
 @pytest.mark.parametrize(("slips", "passes"), [([3.0] * 9, 2), ([3.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5], 4),
                                                (list(range(1, 10)), MAX_PASSES)])  # fmt: skip
 def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
-    """A contact that slides at these speeds after the passes; each takes friction times the last one's slip off."""
+    """A contact that slides at these speeds after the passes; each pass subtracts friction times the last slip."""
     taken: list[float] = []
 
     def constraint(model, data):
@@ -599,7 +601,7 @@ def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
 
 @pytest.mark.parametrize("error", [RuntimeError("Caught an unknown exception!"), ValueError("Error: qhull error")])
 def test_a_model_for_which_memory_is_short_is_out_of_memory(tmp_path, monkeypatch, error):
-    """MuJoCo raises RuntimeError for any exception of C++ that it does not know."""
+    """MuJoCo raises RuntimeError for all C++ exceptions of unknown type."""
 
     def compile(spec):
         raise error

@@ -1,4 +1,4 @@
-"""`--device cuda:1`: nothing is computed on GPU 0."""
+"""`--device cuda:1` does not use GPU 0."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +20,8 @@ pytestmark = [
 
 @contextmanager
 def gpu_0_unused() -> Iterator[None]:
-    """PyTorch takes no memory of it meanwhile."""
-    torch.cuda.init()  # before that there are no statistics
+    """Assert that PyTorch does not allocate memory on GPU 0 within the context."""
+    torch.cuda.init()  # statistics exist only after initialisation
     torch.cuda.reset_peak_memory_stats(0)
     before = torch.cuda.memory_allocated(0)
     try:

@@ -15,7 +15,7 @@ from stages.simulate.setup import set_up_scene
 
 @pytest.mark.parametrize("side", [0.1, 0.12, 0.15])
 def test_boxes_on_the_floor_are_not_moved_for_mpm(side):
-    """A box alone, and small ones of few particles; of a voxel less than a tenth that is filled has no particle."""
+    """One box, and several small ones of few particles; voxels that are less than 1/10 filled have no particle."""
     for places in ([(0.0, 0.0)], [(x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4)]):
         cubes = [box((side,) * 3, side / 24).moved((x, y, side / 2)) for x, y in places]
         parts = [to_gaussians(c, torch.full((len(c.points), 3), 0.5), i + 1, widest=math.inf)

@@ -34,22 +34,22 @@ from tests.conftest import ball
 from tests.segment.tabletop import three_apart
 from tests.simulate.motion import Motion, roll_out
 
-# A ball of 9 kg in point contact indents by 5 mm (Hertz), twice that when set down suddenly, and by a few tenths of a
-# cell (here 5 cm) until enough particles carry it.
+# Sag of a resting ball: in point contact, a ball of 9 kg has an indentation of 5 mm (Hertz), twice as much if released
+# suddenly, and sinks by a few tenths of a cell (here 5 cm) until enough particles carry it.
 SAG = 0.025
 pytestmark = pytest.mark.usefixtures("device")
 
 
 @pytest.fixture(autouse=True)
 def small_draft(monkeypatch):
-    """Few particles, and bodies half as fine as usual."""
+    """Use few particles, and bodies of half the resolution."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
     monkeypatch.setattr(solid_surface, "VOXELS_ALONG", 24)
 
 
 @pytest.fixture(scope="module")
 def balls() -> Scene:
-    """A ball on the floor, one in the air, and background Gaussians."""
+    """A ball on the floor, a ball in the air, and background Gaussians."""
     patch = ball((0.0, 0.0, -0.3), 0.05, 50, (0.5, 0.5, 0.5), 0)
     low = ball((-0.3, 0.0, 0.15), 0.15, 600, (0.9, 0.1, 0.1), 1)
     high = ball((0.3, 0.0, 0.50), 0.12, 600, (0.1, 0.8, 0.1), 2, seed=1)
@@ -68,7 +68,7 @@ def options_with(**options) -> SimulateOptions:
 
 
 def command(file: Path, **options) -> Trajectory:
-    """By the stage, from file to file."""
+    """Run the stage from file to file."""
     out = file.with_name("traj.h5")
     run(file, out, options_with(**options))
     return read_trajectory(out)
@@ -91,7 +91,7 @@ def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(file, caplog):
     assert torch.allclose(t.rotation[0], torch.tensor([1.0, 0, 0, 0]), atol=1e-5)
     assert float(mean_shift(t, 2)[2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.02)
     assert float(t.com[-1, 1, 2] - t.com[0, 1, 2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.02)
-    assert mean_shift(t, 1).norm() < SAG  # stands
+    assert mean_shift(t, 1).norm() < SAG  # it stands
     assert (t.binding.index[t.scene.gaussians.object_id == 0] == -1).all()
     assert f"material not known, taking {DEFAULT_MATERIAL}" in caplog.text and "substep" in caplog.text
     assert " kg if one unit is 1 m" in caplog.text
@@ -132,7 +132,7 @@ def test_lift_velocity_and_pin(file):
 
 
 def test_impulse_of_a_force_equals_change_of_momentum(balls):
-    # F t = m v: a force of 2 m newtons for 0.05 s (ending within a frame) gives 0.1 m/s
+    # F t = m v: a force of 2 m newtons for 0.05 s, ending within a frame, gives 0.1 m/s
     masses = {}
     handler = logging.Handler()
     handler.emit = lambda record: masses.update({record.getMessage().split()[1]: record.getMessage()})
@@ -159,14 +159,14 @@ def test_stiff_materials_are_softened_and_logged(balls, caplog):
 
 
 def test_a_scene_at_rest_gives_a_hint(balls, file, caplog):
-    """Wherever it is, and where each keypoint falls by half a percent of the extent."""
+    """Independent of its position, and if keypoints fall by 0.5 % of the extent."""
     g = balls.gaussians
     write_scene(file, replace(balls, gaussians=replace(g, means=g.means + torch.tensor([20.0, 0.0, 0.0]))))
     caplog.set_level(logging.INFO)
     command(file, steps=3, gravity=5.0)
     assert "everything is at rest" in caplog.text and "--lift 0.3" in caplog.text
     caplog.clear()
-    command(file, steps=5)  # a ball falls by 3 cm, 3.5 % of the extent of the objects
+    command(file, steps=5)  # a ball falls by 3 cm, which is 3.5 % of the extent of the objects
     assert "everything is at rest" not in caplog.text
 
 
@@ -222,7 +222,7 @@ def test_walls_hold(balls):
 
 
 def test_nothing_stops_what_slides_or_rises_but_the_box_that_was_asked_for(balls):
-    """Without friction a ball keeps its 3 m/s for 2.3 m, and another rises as in empty space."""
+    """Without friction one ball keeps its 3 m/s for 2.3 m; another rises as in empty space."""
     t = roll(balls, steps=40, friction=0.0, gravity=1.0, velocity=("object=1 3,0,0", "object=2 0,0,4"))
     assert float(mean_shift(t, 1)[0]) == pytest.approx(3 * 39 * 0.02, rel=0.02)
     assert float(mean_shift(t, 2)[2]) == pytest.approx(4 * 0.78 - 0.78**2 / 2, rel=0.02)
@@ -259,7 +259,7 @@ def test_damaged_options_of_a_trajectory_are_refused(tmp_path, file):
 
 
 def test_a_recording_gives_all_options_that_are_not_given(tmp_path, file):
-    """Those that are repeated are all but what names files and devices, and what acts, which is in the prompts."""
+    """Except options that name files and devices, and those for forces and motions, which are among the prompts."""
     apart = {"material": (), "rest": False, "gravity": 1.62, "steps": 2, "quality": "draft"}
     run(file, tmp_path / "moon.h5", SimulateOptions(engine="mpm", **apart))
     again = with_recorded(SimulateOptions(forces=tmp_path / "moon.h5"))
@@ -322,9 +322,9 @@ def test_doubled_resolution_keeps_bodies_on_the_floor(file):
 
 
 def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path, monkeypatch):
-    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # one of three
     monkeypatch.setattr(network_segmenter, "REDUCTIONS", ())
-    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # of four
+    monkeypatch.setattr(network_segmenter, "COPIES", 1)  # one instead of four
     scene = three_apart(side=0.56, noise=0.002)
     blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
     write_scene(tmp_path / "scene.ply", replace(scene, gaussians=blank))
@@ -351,7 +351,7 @@ def test_plastic_materials_fall_freely_and_sand_slumps(balls, material):
 
 
 def test_the_slowest_vibration_has_the_loss_factor_of_the_material():
-    """Of a bar of length L: omega = pi c / L."""
+    """The frequency of a bar of length L is omega = pi c / L."""
     soft = Material(E=1e5, density=400.0, loss=0.2)
     found = _stable_material(soft, 0.5, 0.01, MpmQuality(1000, 3e-3))
     omega = math.pi * math.sqrt(1e5 / 400.0) / 0.5
@@ -368,7 +368,7 @@ def test_stiff_materials_are_softened_until_waves_cross_a_part_of_a_cell_in_a_su
     speed = math.sqrt(1.2 * found.E / 2500.0)  # (1 - nu) / ((1 + nu) (1 - 2 nu)) = 1.2
     assert 0.2 < speed * substep / (2 * h) < 1 and found.loss == min(loss, 0.6)
     first = _stable_material(stiff, 0.5, 0.01, MpmQuality(1000, 3e-3)).E
-    assert found.E / first == pytest.approx(h / 0.01 * (3e-3 / step) ** 2)  # E / (density g h) hangs on the step alone
+    assert found.E / first == pytest.approx(h / 0.01 * (3e-3 / step) ** 2)  # E / (density g h) depends only on the step
 
 
 @pytest.mark.parametrize("density", [40.0, 2500.0])
@@ -382,7 +382,7 @@ def test_the_viscosity_of_materials_that_flow_is_as_large_as_the_substep_allows(
 
 
 def test_particles_are_the_same_in_any_unit(balls):
-    """The same scene in metres and in half metres: masses, stiffness, damping and places agree."""
+    """For the same scene in metres and half metres, masses, stiffness, damping and positions are equal."""
     options, material = options_with(material=("thing=jelly",), quality="draft"), []
     for unit in (1.0, 0.5):
         g = balls.gaussians
@@ -400,7 +400,7 @@ def test_particles_are_the_same_in_any_unit(balls):
 
 @pytest.mark.parametrize("along", [200, 250, 400, 1000])
 def test_the_default_domain_is_reduced_until_its_grid_fits(along):
-    """Of a cube of side 1 on the floor: twice as large at best, and never less than MIN_ROOM around it."""
+    """For a cube of side 1 on the floor, the margin is at best 1, and never less than MIN_ROOM voxels."""
     h = 1 / along
     box = _default_box(torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), 0.0, h)
     room = -box.low[0]

@@ -1,4 +1,4 @@
-"""Objects at rest sleep until they are hit, pushed or lose their support."""
+"""Objects at rest sleep until they are hit or pushed, or lose their support."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ SIDE = 0.3
 
 
 def stacked(*heights: float, aside: float = 0.0) -> InitialConditions:
-    """Cubes of points with their lower faces at these heights above the floor, in model units."""
+    """Cubes of points whose lower faces are at these heights above the floor, in model units."""
     line = torch.linspace(0, SIDE, 8)
     cube = torch.cartesian_prod(line, line, line)
     points = torch.stack([cube + torch.tensor([i * aside, 0, FLOOR + h]) for i, h in enumerate(heights)])
@@ -24,7 +24,7 @@ def stacked(*heights: float, aside: float = 0.0) -> InitialConditions:
 
 
 def sleep_state(world: InitialConditions, awake: torch.Tensor, device: str = "cpu") -> SleepState:
-    """The sleep state with objects at floor height standing on the floor."""
+    """The sleep state, in which objects at the height of the floor stand on it."""
     return SleepState(world.to(device), awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
 
 
@@ -34,13 +34,13 @@ def none(count: int) -> torch.Tensor:
 
 def test_a_stack_sleeps_and_a_floating_object_does_not(device):
     assert sleep_state(stacked(0.0, SIDE, 2 * SIDE), none(3), device).asleep.all()
-    high = 2 * SIDE + 3 * INITIAL_CONTACT_DISTANCE  # above the second
+    high = 2 * SIDE + 3 * INITIAL_CONTACT_DISTANCE  # above the second cube
     assert sleep_state(stacked(0.0, SIDE, SIDE + high), none(3), device).asleep.tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize(("gap", "touches"), [(0.1, True), (0.13, False)])
 def test_objects_touch_at_the_start_up_to_a_tenth_of_a_metre_and_half_their_spacing(gap, touches):
-    """512 keypoints on cubes of side .3 are .032 apart, as if all were on their faces."""
+    """The assumed spacing of 512 keypoints on cubes of side 0.3 is 0.032, as if all were on the faces."""
     assert sleep_state(stacked(0.0, SIDE + gap), none(2)).asleep.tolist() == [True, touches]
 
 
@@ -71,12 +71,12 @@ def two_balls():
 
 
 def of_learned_engine(**chosen) -> SimulateOptions:
-    """With the shipped weights."""
+    """Options for the learned engine with the shipped weights."""
     return SimulateOptions(engine="ngff", weights=find("ngff", SHIPPED), keypoints=64, quality="draft", **chosen)
 
 
 def test_an_object_slightly_above_the_floor_falls(two_balls):
-    """With both engines: standing means within two particle spacings of the floor."""
+    """In both engines, standing objects are within two particle spacings of the floor."""
     red = two_balls.gaussians.object_id == 1
     means = two_balls.gaussians.means + 0.06 * red[:, None] * torch.tensor([0.0, 0.0, 1.0])
     scene = replace(two_balls, gaussians=replace(two_balls.gaussians, means=means))
@@ -86,7 +86,7 @@ def test_an_object_slightly_above_the_floor_falls(two_balls):
 
 
 def test_an_object_at_rest_moves_only_after_an_impact(two_balls):
-    """The red ball is at rest; the green one is released beside it, then above it."""
+    """The red ball is at rest; the green one is dropped beside it, and then from above it."""
     beside = roll_out(two_balls, of_learned_engine(steps=16))
     moved = (beside.positions - beside.positions[0]).norm(dim=-1)
     assert moved[:, beside.keypoints.object_id == 1].max() == 0 < moved[:, beside.keypoints.object_id == 2].max()

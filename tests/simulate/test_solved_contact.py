@@ -1,4 +1,4 @@
-"""Solved contacts of the learned field against textbook physics, through the stage, and when they are taken."""
+"""Solved contacts of the learned field, compared with textbook physics in complete runs; and their selection."""
 
 import json
 import math
@@ -47,7 +47,7 @@ def test_agrees_with_theory_where_learned_contact_does_not(device, name):
 
 @pytest.mark.parametrize("degrees", [10.0, 25.0])
 def test_a_cylinder_rolls_down_a_slope(device, degrees):
-    """By g sin(degrees) t^2 / 3, straight; a polyhedron loses energy at each edge."""
+    """It rolls straight by g sin(degrees) t^2 / 3; a polyhedron would lose energy at each edge."""
     run = on_slope(degrees, 0.02, {}, cylinder(0.1, 0.3, 0.01).moved((0.0, 0.0, 0.1)))
     options = SimulateOptions(engine="ngff", contact="solved", steps=31, keypoints=64, pin=("1",), device=device)
     t = roll_out(run.scene(), options)
@@ -69,7 +69,7 @@ def test_a_cylinder_rolls_on_the_floor_at_two_thirds_of_its_speed(device):
 
 @pytest.mark.parametrize("upright", [True, False])
 def test_what_stands_and_lies_on_cylinders_stays(device, upright):
-    """A small box on a can, and a plank over the middle of a pinned log, in balance."""
+    """A small box on a can, and a plank balanced on the middle of a pinned log."""
     can = cylinder(0.1, 0.3, 0.01)
     if upright:
         can = Surface(can.points[:, [0, 2, 1]], can.normals[:, [0, 2, 1]])
@@ -85,7 +85,7 @@ def test_what_stands_and_lies_on_cylinders_stays(device, upright):
 
 
 def test_a_light_ball_between_heavy_ones_keeps_momentum_and_gains_no_energy(device, tmp_path):
-    """It rebounds from both by turns, more often than a substep allows."""
+    """It rebounds from both alternately, more often than substeps can resolve."""
     masses = torch.tensor([1.0, 1e-3, 1.0])
     balls = [ball(0.1, (x, 0.0, 0.5), density=1000 * float(m)) for x, m in zip((-0.25, 0.0, 0.2), masses, strict=True)]
     path = tmp_path / "m.json"
@@ -129,7 +129,7 @@ def test_is_the_default_for_stiff_bodies():
 
 
 def test_balls_that_overlap_at_the_start_are_not_pushed_apart(device):
-    """Side by side on the floor, by a twentieth of their radius."""
+    """They are side by side on the floor and overlap by 1/20 of their radius."""
     surfaces = [ellipsoid((0.1,) * 3, 2000).moved((x, 0.0, 0.1)) for x in (0.0, 0.195)]
     grey = torch.full((2000, 3), 0.5)
     parts = [to_gaussians(s, grey[: len(s.points)], i + 1, widest=math.inf) for i, s in enumerate(surfaces)]
@@ -139,11 +139,11 @@ def test_balls_that_overlap_at_the_start_are_not_pushed_apart(device):
 
 
 def test_a_ring_of_random_gaussians_has_its_volume_and_inertia(device):
-    """2 pi^2 R r^2; for each kilogram R^2 + 3/4 r^2 about its axis and R^2 / 2 + 5/8 r^2 across."""
+    """Volume 2 pi^2 R r^2; inertia per mass R^2 + 3/4 r^2 about the axis and R^2 / 2 + 5/8 r^2 perpendicular to it."""
     R, r = 0.2, 0.06
     rng = torch.Generator().manual_seed(0)
     a, b, keep = torch.rand(3, 9000, generator=rng) * torch.tensor([2 * math.pi, 2 * math.pi, R + r])[:, None]
-    a, b = (angle[keep < R + r * b.cos()] for angle in (a, b))  # evenly by area
+    a, b = (angle[keep < R + r * b.cos()] for angle in (a, b))  # uniform over the area
     out = torch.stack([a.cos() * b.cos(), a.sin() * b.cos(), b.sin()], 1)
     points = R * torch.stack([a.cos(), a.sin(), torch.zeros_like(a)], 1) + r * out + torch.tensor([0, 0, 1.0])
     grey = torch.full((len(points), 3), 0.5)
@@ -160,8 +160,9 @@ WALL = compound(0.012, ((0.5, 0.4, 0.04), (0.0, 0.0, 0.02)), ((0.04, 0.4, 0.36),
 
 @pytest.mark.parametrize("name", ["wall", "bowl", "plate"])
 def test_nothing_passes_through_a_wall_in_a_step(device, name):
-    """A ball of radius .05 at 60 m/s, .15 in a substep, in an L and in a bowl, to whose bottom it is nearer than to the
-    wall; and one that a push of one frame gives 400 m/s, before a plate.
+    """A ball of radius 0.05 at 60 m/s moves 0.15 per substep, in an L and near the bottom of a bowl.
+
+    In the third case, a push within one frame gives a ball in front of a plate 400 m/s.
     """
     body, at, push = {
         "wall": (WALL, (0.1, 0.0, 0.1), {"velocity": ("object=1 -60,0,0",)}),
@@ -175,7 +176,7 @@ def test_nothing_passes_through_a_wall_in_a_step(device, name):
     t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=6, dt=0.01, gravity=0.0, pin=("2",),
                                         keypoints=64, device=device, **push))  # fmt: skip
     com = t.com[:, 0]
-    if name == "bowl":  # up its wall and out over the rim
+    if name == "bowl":  # the ball moves up the wall and over the rim
         assert bool((com[com[:, 2] < 0.3] - torch.tensor([0.0, 0.0, 0.3])).norm(dim=1).max() < 0.26)
         assert float(com[-1, 2]) > 0.5
     else:
@@ -183,7 +184,7 @@ def test_nothing_passes_through_a_wall_in_a_step(device, name):
 
 
 def test_an_edge_slides_along_a_face_without_a_jolt(device):
-    """A ladder between a wall and a floor without friction, until it has turned from 60 to 40 degrees."""
+    """A ladder between a wall and a floor without friction rotates from 60 to 40 degrees."""
     length, thick, start = 1.0, 0.1, math.radians(60)
     faces = []
     for axis, sides in enumerate(((0.2, thick), (length, thick), (length, 0.2))):

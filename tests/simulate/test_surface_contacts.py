@@ -20,14 +20,14 @@ mujoco = pytest.importorskip("mujoco")
 
 
 def ball(radius: float, convex: bool = False) -> SurfaceShape:
-    """A ball around the origin."""
+    """A ball with its centre at the origin."""
     return replace(ball_shape(np.zeros(3), radius), convex=convex)
 
 
 class Pair:
-    """Two balls of radii .1 and .2, of which MuJoCo knows only their middles, at a distance along x over a plane.
+    """Two balls of radii 0.1 and 0.2 at a distance along x above a plane; for MuJoCo they are tiny central spheres.
 
-    The first is at `x`; `others` are at these places along x.
+    The first ball is at `x`; `others` are at the given positions along x.
     """
 
     def __init__(self, distance: float, convex: bool = False, x: float = 0.0, others: tuple = ()):
@@ -47,7 +47,7 @@ class Pair:
         self.contacts = SurfaceContacts(mujoco, self.model, self.data, shapes)
 
     def found(self, distance: float, substeps: int = 1, fixed: bool = False, height: float = 0.0):
-        """The contacts after substeps at a distance, to which the second ball moves at once, and both to a height."""
+        """Contacts after substeps, in which the second ball is moved to a distance at once, and both to a height."""
         for _ in range(substeps):
             self.data.qvel[6] = abs(self.x + distance - self.data.qpos[7]) / self.model.opt.timestep
             self.data.qpos[7] = self.x + distance
@@ -63,7 +63,7 @@ def test_depth_and_direction_of_contacts_between_balls():
     assert contact.dist.min() == pytest.approx(-0.02, abs=2e-4)
     deepest = contact.dist.argmin()
     # the normal points from the first geometry's body to the second one's
-    x = np.array([np.nan, 0.0, 0.28])[contact.geom[deepest]]  # the plane is the first one
+    x = np.array([np.nan, 0.0, 0.28])[contact.geom[deepest]]  # geometry 0 is the plane
     assert contact.frame[deepest, :3] @ [x[1] - x[0], 0, 0] == pytest.approx(0.28, rel=0.01)
     frames = contact.frame.reshape(-1, 3, 3)
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
@@ -73,21 +73,21 @@ def test_depth_and_direction_of_contacts_between_balls():
 
 
 def test_distances_are_those_of_each_pair():
-    """Away from the origin, with a third ball far away before and behind."""
+    """The balls are not at the origin, and a third ball is far away on either side."""
     alone = Pair(0.5).found(0.28)
     for others in ((-5.0,), (9.0,)):
         pair = Pair(0.5, x=3.0, others=others)
         contact = pair.found(0.28)
-        assert pair.contacts._path == pytest.approx([0.0, 0.22, 0.0])  # only the second one has moved
+        assert pair.contacts._path == pytest.approx([0.0, 0.22, 0.0])  # only the second ball has moved
         assert contact.dist.min() == pytest.approx(alone.dist.min(), abs=1e-9) and len(contact.dist) == len(alone.dist)
 
 
 def test_contacts_are_those_that_span_the_touching_patch_and_the_deepest():
-    """At most nine for each pair of surfaces and direction; contacts of parts beside them are excluded."""
+    """There are at most nine per pair of surfaces and direction; MuJoCo's contacts of the same bodies are excluded."""
     pair = Pair(0.5)
     contact = pair.found(0.28)
     assert 1 <= len(contact.dist) <= 2 * 6 * 9
-    pair.data.qpos[7] = pair.x + 0.0005  # now the middles, which MuJoCo knows, touch
+    pair.data.qpos[7] = pair.x + 0.0005  # now the spheres at the centres, which MuJoCo knows, touch
     mujoco.mj_fwdPosition(pair.model, pair.data)
     assert pair.data.ncon == 1
     pair.contacts.exclude(pair.data)
@@ -115,7 +115,7 @@ def test_the_overlap_at_the_start_is_no_contact_nor_the_least_one_since():
 
 
 def test_contacts_with_a_plane_begin_at_the_overlap_of_the_start():
-    """The large ball is .01 below the plane at the start."""
+    """The large ball is initially 0.01 below the plane."""
     contact = Pair(0.5).found(0.5, height=-0.03)
     assert len(contact.dist) and contact.dist.min() == pytest.approx(-0.03, abs=1e-3)
     assert (contact.geom == [0, 2]).all() and (contact.frame[:, :3] == [0, 0, 1]).all()
@@ -129,7 +129,7 @@ def test_contacts_with_a_plane_begin_at_the_overlap_of_the_start():
 
 
 def test_shape_of_a_box_that_ends_at_the_floor():
-    """A box of 1 x 1 x .5 whose lowest quarter is below the floor, in units of half its length about a point in it."""
+    """A box of 1 x 1 x 0.5 with its lowest quarter below the floor, in units of 1/2, relative to a point in it."""
     points = box((1.0, 1.0, 0.5), 0.02).points.double().numpy()
     line = np.arange(-0.49, 0.5, 0.02)
     body = SolidSurface(np.stack(np.meshgrid(line, line, line[np.abs(line) < 0.25], indexing="ij"), -1).reshape(-1, 3),
@@ -142,13 +142,13 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     assert x[:, 2].min() == pytest.approx(-0.125)
     under = x[(shape.normals[:, 2] == -1) & (np.abs(x[:, :2]) < 0.45).all(1)]
     assert len(under) > 1000 and np.abs(under[:, 2] + 0.125).max() < 1e-9
-    top = x[(shape.normals[:, 2] > 0.9) & (np.abs(x[:, :2]) < 0.45).all(1)]  # edges are rounded
+    top = x[(shape.normals[:, 2] > 0.9) & (np.abs(x[:, :2]) < 0.45).all(1)]  # without the rounded edges
     assert len(top) > 1000 and np.abs(top[:, 2] - 0.25).max() < 0.003
 
 
 @pytest.mark.parametrize("gap", [-0.03, -0.004, 0.0, 0.001, 0.004, 0.01])
 def test_a_body_that_ends_about_at_the_floor_has_one_underside(gap):
-    """A slab, with voxels of .01, whose underside is that far from the floor, below which it is cut off."""
+    """A slab with voxels of 0.01 is cut off at the floor, from which its underside has this distance."""
     line = np.arange(-0.495, 0.5, 0.01)
     high = np.arange(0.005, 0.1, 0.01)
     points = box((1.0, 1.0, 0.1), 0.01).points.double().numpy() + [0, 0, 0.05]
@@ -156,11 +156,11 @@ def test_a_body_that_ends_about_at_the_floor_has_one_underside(gap):
     x, normals = body.fitted.samples_above(-gap)
     under = (normals[:, 2] < -0.9) & (np.abs(x[:, :2]) < 0.45).all(1)
     assert np.abs(x[under, 2] - max(0.0, -gap)).max() < 0.0025 + 1e-9 and (x[:, 2] >= -gap).all()
-    assert 7000 < under.sum() < 10000  # one in each voxel
+    assert 7000 < under.sum() < 10000  # one sample in each voxel
 
 
 def test_a_convex_body_has_the_faces_of_its_hull():
-    """A cube, samples of which beyond an edge are on no face."""
+    """For a cube, samples beyond an edge belong to no face."""
     line = np.arange(-0.475, 0.5, 0.05)
     points = box((1.0, 1.0, 1.0), 0.04).points.double().numpy()
     body = SolidSurface(np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3), 0.05, points)
@@ -183,7 +183,7 @@ def test_depths_on_the_grid_are_those_at_its_nodes():
 
 
 def test_voxels_around_a_symmetric_body_are_symmetric():
-    """A slab of 9 x 9 x 5 voxels of edge .1 and points on its faces: one voxel around it, and itself inside."""
+    """A slab of 9 x 9 x 5 voxels with edge 0.1 and points on its faces has one layer of voxels around it."""
     line = 0.1 * np.arange(-4, 4.5)
     slab = np.stack(np.meshgrid(line, line, line[2:-2], indexing="ij"), -1).reshape(-1, 3)
     body = SolidSurface(slab + 0.05, 0.1, box((0.9, 0.9, 0.5), 0.03).points.double().numpy() + 0.05)
@@ -197,7 +197,7 @@ def test_voxels_around_a_symmetric_body_are_symmetric():
 
 
 def test_a_tangent_plane_continues_as_far_as_its_samples_are_apart():
-    """Samples .4 voxels above the voxels' top, on its left half: to the right that of the voxels counts."""
+    """Samples on the left half are 0.4 voxels above the top of the voxels; on the right half, the voxels count."""
     line = 0.1 * np.arange(-9, 10)
     slab = np.stack(np.meshgrid(line, line, line[7:-7], indexing="ij"), -1).reshape(-1, 3)
     x, y = np.meshgrid(np.arange(-0.94, 0.0, 0.03), np.arange(-0.94, 0.95, 0.03))
@@ -224,7 +224,7 @@ def bumpy(side: float, height: float, bump: float) -> Surface:
 
 
 def test_a_small_body_does_not_enter_the_bumps_of_a_large_one(tmp_path):
-    """Bumps of half a voxel of the slab are a quarter of the cube's height, by .14 of which it sank into the parts."""
+    """Bumps of half a voxel are 1/4 of the cube's height; by parts, the cube would penetrate by 0.14 of its height."""
     scene = scene_of((bumpy(1.0, 0.1, 0.01), cube(0.04, 0.12, 0.15).moved((0.0, -0.05, 0.0))))
     t = roll_out(scene, options_of(scene, tmp_path, steps=22, pin=("1",), keypoints=300))
     slab = solid_surface(scene, 1)

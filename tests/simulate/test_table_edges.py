@@ -1,4 +1,4 @@
-"""Rigid bodies at the edge of a table: what is supported stays, the rest falls to the ground."""
+"""Rigid bodies at the edge of a table: supported ones stay, others fall to the ground."""
 
 import json
 import logging
@@ -28,7 +28,7 @@ G, EDGE = 9.81, HIGH[0]
 
 @pytest.fixture(autouse=True)
 def few_particles(monkeypatch):
-    """Those of a body decide on whether it stands on the floor; its mass and contacts have other sources."""
+    """Particles of a body only decide whether it stands on the floor; its mass and contacts do not depend on them."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
 
 
@@ -57,7 +57,7 @@ def tilt(t: Motion) -> torch.Tensor:
 
 
 def test_a_block_that_stops_over_the_edge_is_held_by_it(tmp_path, monkeypatch):
-    """Its centre comes to rest .04 before the edge, with two of its four lower corners beyond it."""
+    """Its centre comes to rest 0.04 before the edge, with two of its four lower corners beyond the edge."""
 
     def of_corners(*args):
         sides = ((p, torch.stack(p.hull.aminmax(dim=0), 1), ground) for p, ground in standing_shapes(*args))
@@ -79,13 +79,13 @@ def test_a_ball_that_rolls_over_the_edge_falls_in_a_parabola(tmp_path):
     assert float(z[: off - 5].min()) > 0.038  # it is on the table until then
     fall = (z[off : off + 20] - z[off]).double()
     time = 0.01 * torch.arange(20).double()
-    speed = (fall[-1] + G * time[-1] ** 2 / 2) / time[-1]  # downwards at `off`
+    speed = (fall[-1] + G * time[-1] ** 2 / 2) / time[-1]  # speed at frame `off`, positive upwards
     torch.testing.assert_close(fall, speed * time - G * time**2 / 2, atol=2e-3, rtol=0)
     assert float(z[-1]) < -0.1 and -0.6 < float(speed) < 0.1
 
 
 def test_what_slides_over_the_edge_lands_on_the_ground_and_does_not_sink(tmp_path, caplog):
-    """By the command; with --floor the floor has no edge."""
+    """Run as a stage, from file to file; with --floor, the floor has no edge."""
     scene = on_table(block(0.2))
     write_scene(tmp_path / "scene.ply", scene)
     options = {"velocity": ("object=1 2,0,0",), "steps": 70}
@@ -100,11 +100,11 @@ def test_what_slides_over_the_edge_lands_on_the_ground_and_does_not_sink(tmp_pat
 
 
 def test_depth_in_a_table_is_that_below_its_top_or_from_its_side(tmp_path):
-    """A block of height .04 whose end is below the top, .03 of it over the table or .01."""
+    """The end of a block of height 0.04 is below the top, and extends 0.03 or 0.01 over the table."""
     scene = on_table(block(0.2))
     keypoints, options = choose_keypoints(scene, 200), options_of(tmp_path)
     com, no_turn = torch.tensor([[0.2, 0.0, 0.02]]), torch.tensor([[1.0, 0, 0, 0]])
-    edge = EDGE - float(table_outline(scene).beyond(np.array([[EDGE, 0.0]]))[0])  # as seen
+    edge = EDGE - float(table_outline(scene).beyond(np.array([[EDGE, 0.0]]))[0])  # position of the edge as detected
     for over, depth in ((0.03, 0.015), (0.01, 0.01)):
         monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), options)
         for shift in (torch.zeros(3), torch.tensor([edge + 0.06 - over - 0.2, 0.0, -0.015])):

@@ -12,7 +12,7 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 LONGEST = 120.0  # longest wait for a busy machine [s]
-SIZE = {"width": 480, "height": 360}  # of the window [px]
+SIZE = {"width": 480, "height": 360}  # size of the window [px]
 
 
 def until(page, condition: str, seconds: float = LONGEST) -> None:

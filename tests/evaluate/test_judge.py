@@ -38,7 +38,7 @@ def films(tmp_path_factory):
 
 
 def by_brightness(body: dict) -> str:
-    """Reply of a judge for whom bright films look realistic and have unrealistic physics."""
+    """Reply of a judge who considers bright films photorealistic and dark films physically realistic."""
     scores, letter = {}, ""
     for part in body["messages"][0]["content"][1:]:
         if part["type"] == "text":

@@ -46,7 +46,7 @@ def test_only_a_hard_enough_hit_moves_an_object_at_rest(speed, moves):
     t = roll(cube(0.1, 0, 0), cube(0.1, 0.11, 0), steps=30, friction=0.2, velocity=(f"object=1 {speed},0,0",))
     assert (float(moved(t, 1)[0]) > 0.02) == moves
     if moves:  # the step that wakes it is repeated, so that the impact is on a free body and momentum is conserved
-        lost = 0.2 * 9.81 * 0.05  # by friction of one of them, until the middle of the frame
+        lost = 0.2 * 9.81 * 0.05  # momentum lost to friction of one of them until the middle of the frame
         assert 1 - 2 * lost - 0.01 < float((t.com[3, :, 0] - t.com[2, :, 0]).sum() / 0.02) < 1 - lost + 0.01
 
 

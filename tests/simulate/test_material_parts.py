@@ -39,7 +39,7 @@ def deflection(length: float, side: float, density: float, E: list[float], nu: f
     """
     x = (torch.arange(2000, dtype=torch.float64) + 0.5) / 2000 * length
     modulus = torch.tensor(E, dtype=torch.float64)[(x / length * len(E)).long()]
-    load = density * G * side**2  # [N/m]
+    load = density * G * side**2  # weight per length [N/m]
     bending = load * (length - x) ** 2 / 2 / (modulus * side**4 / 12) * (length - x)
     shear = load * (length - x) / (5 / 6 * modulus / (2 * (1 + nu)) * side**2)
     return float((bending + shear).sum() * length / 2000)
@@ -89,7 +89,7 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
         volume = sum(masses(caplog.text)) / 1000  # [m^3], as filled by the voxels of the engine
         caplog.clear()
         t = roll(tmp_path, column(), [POT, STEM], engine=engine, steps=1)
-    heavy, light = 1500 * volume / 3, 300 * volume * 2 / 3  # [kg]
+    heavy, light = 1500 * volume / 3, 300 * volume * 2 / 3  # masses of the parts [kg]
     # the border between the parts, at 1/3 of the height, is displaced by up to a voxel of 8 mm, or 8 % of POT
     assert sum(masses(caplog.text)) == pytest.approx(heavy + light, rel=0.08)
     assert ("the average of its parts" in caplog.text) == (engine != "mpm")

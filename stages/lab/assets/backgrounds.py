@@ -19,7 +19,8 @@ from stages.lab.assets.shapes import Surface, noise, single_threaded, to_gaussia
 from stages.lab.names import chosen_names
 
 TABLE_HEIGHT, FLOOR_HEIGHT, CEILING_HEIGHT = -0.94, -2.5, 1.7  # z of table top, floor and ceiling [m]
-TABLE_HALF_WIDTH, ROOM_HALF_WIDTH = 2.1, 6.6  # of the square table and of the room [m]; cameras orbit at 3.8
+# half widths of the square table and of the room [m]; cameras orbit at 3.8
+TABLE_HALF_WIDTH, ROOM_HALF_WIDTH = 2.1, 6.6
 TABLE_THICKNESS, LEG_HALF_WIDTH = 0.14, 0.13  # thickness of the table top, and half width of a leg [m]
 TABLE_SPACING, ROOM_SPACING = 0.0235, 0.14  # spacing of Gaussians on the table top, and on floor and walls [m]
 BACKGROUND_PLY = "gaussians_feedforward.ply"  # file name in the folder of a background

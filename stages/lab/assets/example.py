@@ -21,7 +21,7 @@ from stages.lab.assets.toys import falling_toys
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
-WIDTH, HEIGHT, FOCAL = 640, 480, 620.0  # of the photos [px]
+WIDTH, HEIGHT, FOCAL = 640, 480, 620.0  # size and focal length of the photos [px]
 WALL = torch.tensor([0.62, 0.66, 0.70])  # background colour of the photos
 
 

@@ -47,7 +47,7 @@ def gaussians_from_parts(
 def sample_parts(
     parts: list[PaintedPart], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """As `gaussians_from_parts`, but not normalised, and also the part nearest to each Gaussian."""
+    """Like `gaussians_from_parts`, but not normalised; also returns the part nearest to each Gaussian."""
     field = union(*(part.field for part in parts), smooth=smooth)
     surface = relax_points(field, sample_surface(field, half, n, skin))
     p = surface.points

@@ -99,7 +99,7 @@ def can() -> Gaussians:
     def paint(p: Tensor) -> Tensor:
         r, z, azimuth = p[:, :2].norm(dim=1), p[:, 2], torch.atan2(p[:, 0], -p[:, 1])
         rgb = mix((0.62, 0.02, 0.04), (0.84, 0.05, 0.07), (z + 0.4) / 0.7)
-        for side in (0.26, 0.26 + math.pi):  # one of the two faces the camera of view 0
+        for side in (0.26, 0.26 + math.pi):  # one of the two sides faces the camera of view 0
             u = torch.remainder(azimuth - side + math.pi, 2 * math.pi) - math.pi
             q = torch.stack([u * 0.262, z], 1)
             crest = -0.2 + 0.07 * torch.sin(u * 2.0 + 0.6)

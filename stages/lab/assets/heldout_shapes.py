@@ -38,8 +38,8 @@ class ShapeKind:
 
     id: int
     scale: float  # longest side [m]
-    E: float  # [Pa]
-    density: float  # [kg/m^3]
+    E: float  # Young's modulus [Pa]
+    density: float  # density [kg/m^3]
     shape: Callable[[], Field]  # within a cube of +-0.6, before normalisation to longest side 1
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from stages.core.errors import InputError
 
 log = logging.getLogger(__name__)
-MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")  # in order of preference
-PART_NUMBER = re.compile(r"([ _.-]+|(?<=part)|(?<=piece)|(?<=mesh)|(?<=geom))\d+$", re.IGNORECASE)  # at the stem's end
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")  # suffixes in order of preference
+# number of a part at the end of the stem
+PART_NUMBER = re.compile(r"([ _.-]+|(?<=part)|(?<=piece)|(?<=mesh)|(?<=geom))\d+$", re.IGNORECASE)
 GENERIC_STEMS = ("mesh", "model", "object", "scene", "textured", "part", "piece", "geom")  # the folder names the object
 
 

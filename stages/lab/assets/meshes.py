@@ -115,7 +115,7 @@ def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Floa
         vertex = torch.from_numpy(np.array(visual.vertex_colors[:, :3], np.float32)) / 255
         return (vertex[corner] * weight[..., None]).sum(1)
     material = getattr(visual, "material", None)
-    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # of glTF and of OBJ
+    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # textures of glTF and of OBJ
     image = next((image for image in images if image is not None), None)
     if image is None or getattr(visual, "uv", None) is None:
         return _material_colour(material).expand(len(face), 3)

@@ -23,10 +23,10 @@ class ObjectKind:
     """An object of the data set. Source: paper and public code of NGFF, values of GSCollision."""
 
     name: str
-    id: int  # as in scene_object_idxs
+    id: int  # number used in scene_object_idxs
     scale: float  # scale prior in scenes, relative to the generated size
     E: float  # Young's modulus [Pa]
-    density: float  # [kg/m^3]
+    density: float  # density [kg/m^3]
     prompt: str  # text prompt
     make: str  # generator as module:function
     side: float = 1.0  # longest side of the generated object [scene units]

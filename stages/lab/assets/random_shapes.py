@@ -30,7 +30,7 @@ from stages.lab.assets.signed_distance import (
 
 FIRST_ID = 1000  # first object id
 SIZE_RANGE = (0.3, 1.0)  # longest side [m]
-DENSITY_RANGE = (100.0, 2700.0)  # [kg/m^3]
+DENSITY_RANGE = (100.0, 2700.0)  # range of densities [kg/m^3]
 # E / density [m^2/s^2], from the rope to the phone; stable at the published substep
 SPECIFIC_STIFFNESS_RANGE = (10.0, 7400.0)
 MAX_RADIUS = 0.55  # largest distance of a point of a shape from its centre

@@ -27,7 +27,7 @@ MAX_RADIUS = 1.5  # largest distance of an object's points from the centre of th
 MIN_GAP = 0.12  # smallest distance between separate objects [m]
 CONTACT_GAP = 0.015  # distance between the nearest Gaussians of touching objects [m], about their spacing
 DISTANCE_SAMPLES = 4000  # number of Gaussians per object used to compute distances
-WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the cameras [px]
+WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # size and focal length of the cameras [px]
 CAMERA_DISTANCE = 3.8  # distance of the cameras from the scene, as in the data set [m]
 
 

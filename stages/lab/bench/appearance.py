@@ -52,7 +52,7 @@ class MethodScore:
     gaussians: int
     psnr: float  # mean over held-out photos [dB]
     ssim: float  # mean over held-out photos
-    psnr_exposed: float  # as `psnr`, after fitting the exposure of each photo [dB]
+    psnr_exposed: float  # like `psnr`, after fitting the exposure of each photo [dB]
 
     def __str__(self) -> str:
         shown = f"{self.psnr:6.2f} ({self.psnr_exposed:5.2f}) dB {self.ssim:.3f}"

@@ -19,7 +19,8 @@ from stages.lab.bench.speed_options import ChainBenchOptions, ChainTableOptions
 from stages.lab.track.stand_in import StandInOptions, write_photos
 
 STAGES = ("reconstruct", "segment", "refine", "simulate", "render")
-PAPER_SECONDS = {3: {True: 37, False: 12}, 6: {True: 72, False: 19}}  # by number of objects, and whether refine is run
+# published seconds by number of objects and whether refine is run
+PAPER_SECONDS = {3: {True: 37, False: 12}, 6: {True: 72, False: 19}}
 
 
 def run(out: Path | None, options: ChainTableOptions) -> Iterator[str]:

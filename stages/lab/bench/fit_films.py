@@ -46,7 +46,7 @@ class FilmedToy:
 
     scene: Scene
     material: Material
-    velocity: tuple[float, float, float]  # at the start [m/s]
+    velocity: tuple[float, float, float]  # initial velocity [m/s]
 
 
 def filmed_toy(kind: str, cameras: int, width: int, seed: int) -> FilmedToy:

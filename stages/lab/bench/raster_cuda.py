@@ -26,7 +26,7 @@ from stages.lab.bench.speed_options import RasterBenchOptions
 from stages.reconstruct.photometric import FitOptions, fit_gaussians
 from stages.reconstruct.photos import Views
 
-OPERATIONS_PER_TEST = 10  # of the quadratic form and the comparison
+OPERATIONS_PER_TEST = 10  # operations of the quadratic form and the comparison
 FIT_PIXELS = 640  # side of the image of the photometric fit
 FIT_STEPS = 50, 190  # lengths of two fits whose difference gives the time of a step; longer fits split Gaussians
 

@@ -50,7 +50,7 @@ class RegistrationTrial:
     """A part of an object, and the true pose of the complete object."""
 
     part: Gaussians
-    truth: Similarity  # from complete object to part
+    truth: Similarity  # similarity that maps the complete object to the part
     seen: Float[Tensor, "k"]  # indices of the part in the whole
 
 

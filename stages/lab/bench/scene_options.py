@@ -90,8 +90,8 @@ class SegmentAblationData:
     """Folders of scenes written by `ngff-lab clutter --reconstruct` and `--exact`; no scene may be in two of them."""
 
     train: Sequence[Path]  # reconstructions, and the true Gaussians of the same scenes
-    scores: Sequence[Path]  # for training the scores of candidates
-    judge: Sequence[Path]  # for evaluation
+    scores: Sequence[Path]  # scenes for training the scores of candidates
+    judge: Sequence[Path]  # scenes for evaluation
 
 
 @dataclass(frozen=True)

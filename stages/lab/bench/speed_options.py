@@ -89,7 +89,7 @@ class ChainTableOptions:
 
     objects: tuple[int, ...] = (3, 6)
     photos: int = 20
-    width: int = 448  # of the photos [px]
+    width: int = 448  # width of the photos [px]
     quality: str = option("normal", "quality of the reconstruction")
     steps: int = option(100, "frames of the video", min=1)
     repeat: int = option(2, "runs in one process; the first one loads kernels")

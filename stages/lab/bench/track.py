@@ -47,8 +47,8 @@ MATCHED = 0.06  # largest distance between a found and a true object at the rele
 class PoseErrors(NamedTuple):
     """Errors of each true object in each frame; nan (and not seen) for objects that were not found."""
 
-    distance: Float[Tensor, "t o"]  # of the object's centre [m]
-    angle: Float[Tensor, "t o"]  # of the rotation since the release [degrees]
+    distance: Float[Tensor, "t o"]  # error of the object's centre [m]
+    angle: Float[Tensor, "t o"]  # error of the rotation since the release [degrees]
     seen: Bool[Tensor, "t o"]
 
 

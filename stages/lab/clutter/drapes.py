@@ -22,9 +22,9 @@ RIM = 0.002  # height above which a point is covered by cloth [camera distances]
 class Drape:
     """A height field over a rectangle, zero where there is no cloth; lengths in camera distances."""
 
-    heights: Float[Tensor, "CELLS CELLS"]  # [row of y, column of x]
+    heights: Float[Tensor, "CELLS CELLS"]  # height at each node, indexed by row (y) and column (x)
     half: tuple[float, float]  # half sides of the rectangle
-    at: tuple[float, float]  # its centre
+    at: tuple[float, float]  # centre of the rectangle
     yaw: float  # rotation about z [rad]
 
     def local(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:

@@ -52,7 +52,7 @@ class Prop:
     """An object with longest side 1, centred on the origin, and how it is used."""
 
     name: str
-    gaussians: Gaussians  # with object_id 1
+    gaussians: Gaussians  # all have object_id 1
     sizes: tuple[float, float]  # range of the longest side [camera distances]
     flat: bool = False  # lies on its largest side, which is horizontal in this orientation
     clutter: bool = False  # too thin to be an object that a user would move; labelled as background

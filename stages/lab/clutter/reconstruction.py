@@ -28,7 +28,7 @@ FLOATER = -1  # label of floaters
 POINTS = (600, 2500)  # number of points of the sparse model, as structure from motion finds in a dozen photos
 POINT_NOISE = 0.002  # standard deviation of the sparse points' positions [camera distances]
 HIDDEN = 0.02  # depth difference to the visible surface from which a point is not seen [camera distances]
-ITERATIONS = 600  # of the photometric fit; positions hardly change later
+ITERATIONS = 600  # iterations of the photometric fit; positions hardly change later
 
 
 def reconstructed(

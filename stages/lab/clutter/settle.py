@@ -10,9 +10,9 @@ from torch import Tensor
 
 from stages.lab.clutter.supports import Furniture
 
-TIMESTEP, DURATION = 0.004, 1.6  # of the simulation [s]
+TIMESTEP, DURATION = 0.004, 1.6  # time step and duration of the simulation [s]
 CORNERS = 60  # maximum number of vertices of a hull
-DENSITY = 300.0  # of all objects
+DENSITY = 300.0  # density of all objects
 
 
 def hull_corners(points: Tensor, margin: float) -> np.ndarray:

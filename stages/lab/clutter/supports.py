@@ -34,7 +34,7 @@ class StaticBox:
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
-    spacing: float = SPACING  # of the Gaussians on its faces
+    spacing: float = SPACING  # spacing of the Gaussians on its faces
     yaw: float = 0.0  # rotation about z [rad], applied after `tilt`
     tilt: float = 0.0  # rotation about x [rad]
     paint: int | None = None  # boxes with the same number have the same paint; None: a paint of its own
@@ -57,7 +57,7 @@ class Furniture:
     blocks: list[StaticBox]
     areas: list[tuple[float, float, float, float, float]]  # x0 x1 y0 y1 z of each surface for objects
     open_sides: tuple[float, float]  # range of camera azimuths without walls [rad]
-    drapes: tuple[Drape, ...] = ()  # on the first area
+    drapes: tuple[Drape, ...] = ()  # cloths on the first area
     back: float = 1.0  # y coordinate from which there is space behind the furniture
 
     def rise(self, low: tuple[float, float], high: tuple[float, float]) -> float:

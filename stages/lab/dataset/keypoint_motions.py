@@ -45,12 +45,12 @@ class KeypointMotions:
     names: tuple[str, ...]
     objects: Int[Tensor, "s o"]  # GSCollision ids; -1: no object
     points: Float[Tensor, "s t o n 3"]  # [m]; 0 where there is no object
-    mass: Float[Tensor, "s o"]  # [kg]
-    E: Float[Tensor, "s o"]  # [Pa]
+    mass: Float[Tensor, "s o"]  # mass of each object [kg]
+    E: Float[Tensor, "s o"]  # Young's modulus of each object [Pa]
     nu: Float[Tensor, "s o"]  # Poisson's ratio
     friction: Float[Tensor, "s o"]  # Coulomb coefficient
     dt: float  # between frames [s]
-    gravity: tuple[float, float, float]  # [m/s^2]
+    gravity: tuple[float, float, float]  # acceleration of gravity [m/s^2]
     box: tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner of the walls [m]
     solidity: Float[Tensor, "s o"]  # stiffness relative to a hollow or thin body of the same material
 

@@ -27,7 +27,7 @@ from stages.lab.assets.shapes import single_threaded
 from stages.lab.dataset.options import Discretisation
 from stages.lab.dataset.scene_configs import PlacementExtent
 
-POISSON_RATIO = 0.3  # of all objects, as published
+POISSON_RATIO = 0.3  # Poisson's ratio of all objects, as published
 FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a Coulomb coefficient of 1 or more
 PLACEMENT_POINTS = 2048  # number of particles of an object from which distances between objects are computed
 
@@ -39,9 +39,9 @@ class Asset:
     id: int
     scale: float
     points: Float[Tensor, "p 3"]  # [m], in farthest-point order
-    volume: Float[Tensor, "p"]  # [m^3]
+    volume: Float[Tensor, "p"]  # volume of each particle [m^3]
     E: float  # Young's modulus [Pa]
-    density: float  # [kg/m^3]
+    density: float  # density [kg/m^3]
     solidity: float = 1.0  # stiffness relative to a hollow or thin body of the same material
 
     @cached_property

@@ -27,7 +27,7 @@ from stages.lab.dataset.scene_configs import perturbed, sample_group
 from stages.lab.dataset.simulation import SimulationSettings, simulate
 
 FULL_SPACING = 1e-6  # particle spacing at which all Gaussians are used [m]
-FRAMES, KEYPOINTS = 80, 512  # of each scene, and of each object
+FRAMES, KEYPOINTS = 80, 512  # frames of each scene, and keypoints of each object
 PUBLISHED_RESOLUTION = Discretisation(0.02, FULL_SPACING, 1e-4)
 COMPARED_RESOLUTIONS = (
     Discretisation(0.02, 0.009, 1e-4), Discretisation(0.02, 0.0125, 1e-4), Discretisation(0.02, 0.009, 2e-4),
@@ -43,7 +43,7 @@ class ResolutionResult:
     dx: float  # grid spacing [m]
     particles: float  # mean per scene
     per_cell: float  # mean number of particles per occupied cell
-    substep: float  # [s]
+    substep: float  # substep of the simulation [s]
     rmse: float  # mean over scenes [m]
     rmse_median: float  # median over scenes [m]
     fpe: float  # final position error, mean over scenes [m]

@@ -22,7 +22,7 @@ from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.schema import number, numbers, quote, read_json, reason, rows, whole
 from stages.lab.dataset.selection import MORE_GROUPS, SCENE_COUNTS, object_count
 
-SEED = 42  # of the public sampling code
+SEED = 42  # seed of the published sampling code
 HALF_EXTENT = 0.9  # half side of the cube that contains all bounding spheres [m]
 MIN_GAP = 0.05  # smallest distance between points of two objects, and between their centres [m]
 MAX_OFFSET = 0.1  # largest horizontal offset from an earlier object, per axis, in scenes of up to 4 objects [m]

@@ -37,7 +37,7 @@ class SceneAssets:
 
     particles: Mapping[int, Asset]
     skins: Mapping[int, ObjectSkin]
-    backgrounds: Mapping[str, Gaussians]  # on the rendering device
+    backgrounds: Mapping[str, Gaussians]  # backgrounds by name, on the rendering device
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ WALL_RETENTION = 0.9  # fraction of the tangential speed kept at walls, per publ
 # Largest Courant number at which the given substep is kept, that of the bowl at the published substep; shells gain
 # energy from 0.7.
 MAX_COURANT = 0.68
-MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (BOX[1][2] - BOX[0][2]))  # for a fall from ceiling to floor [m/s]
+MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (BOX[1][2] - BOX[0][2]))  # speed after a fall from ceiling to floor [m/s]
 CPU_BATCH_SCENES = 4  # scenes per batch on a CPU
 GPU_BATCH_PARTICLES = 1_500_000  # particles per batch on a GPU: enough to occupy it; more would only use memory
 

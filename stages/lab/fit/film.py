@@ -65,13 +65,13 @@ class Picture:
 class FilmProblem(Problem):
     """A scene and films of it; `track` is the motion that was tracked through the films."""
 
-    cameras: tuple[Camera, ...]  # one per film
+    cameras: tuple[Camera, ...]  # cameras of the films, in the same order
     skinning: Skinning  # moves the Gaussians of the objects with the keypoints
     pictures: tuple[Picture, ...]
     scale: float  # scale of the Geman-McClure function: larger residuals lose weight [colours from 0 to 1]
-    reduction: int  # of the images
+    reduction: int  # factor by which the images are reduced
 
-    unit = "colours from 0 to 1"  # of `rmse`
+    unit = "colours from 0 to 1"  # unit of `rmse`
     # the mean square of true motions was at most 1.008 times that of tracks (bench, seeds 100 to 102)
     noise_margin = 1.02
 

@@ -45,7 +45,7 @@ class Fit:
     problem: Problem
     found: Estimate  # the most probable point
     accepted: np.ndarray  # the same, with initial values where the motion does not determine a parameter [ranges]
-    rmse: tuple[float, float]  # of the motion, before and after the fit [unit of the problem]
+    rmse: tuple[float, float]  # RMSE of the motion before and after the fit [unit of the problem]
     evaluations: int
     seconds: float
     determined: bool = True  # whether intervals were computed before the time ran out

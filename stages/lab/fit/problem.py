@@ -60,7 +60,7 @@ class Problem:
     parameters: tuple[Parameter, ...]
     noise: float  # standard deviation of a coordinate of the track [scene units]
 
-    unit = "scene units"  # of `rmse`
+    unit = "scene units"  # unit of `rmse`
     noise_margin = 1.1  # factor on the noise variance of the track, which is estimated to within 10 %
 
     @property

@@ -43,7 +43,7 @@ STEPS = 6  # iterations of the Levenberg-Marquardt method
 PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative decrease of the cost at which a method stops
 SPREADS = (0.5, 1.0, 0.2, 1.5)  # initial step sizes of CMA-ES, in turn [standard deviations]; stops if all fail
 GAIN = 0.05  # smallest relative decrease of the cost that counts as an improvement
-GENERATIONS = 15  # of each CMA-ES run
+GENERATIONS = 15  # generations of each CMA-ES run
 ENOUGH = 1.15, 0.0005  # a fit stops at this factor times the cost of the track's noise plus this constant
 SMALLEST = 0.002  # lower bound of the standard deviation of a parameter [ranges]
 SETTLING = 2  # final estimates of the uncertainty, each with differences scaled by the previous estimate
@@ -138,7 +138,7 @@ class Simulations:
         return max(self.problem.noise_level, SMALLEST_ERROR)
 
 
-_problem: Problem | None = None  # of this worker process
+_problem: Problem | None = None  # problem of this worker process
 
 
 def _set_problem(problem: Problem, threads: int) -> None:

@@ -108,7 +108,7 @@ def write_colmap(folder: Path) -> None:
     lines = [f"{i + 1} {' '.join(map(str, pose))} 1 {'ab'[i]}.png\n1.0 2.0 -1" for i, pose in enumerate(poses)]
     (folder / "images.txt").write_text("# images\n" + "\n".join(lines) + "\n")
     (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 32 24 " + " ".join(map(str, camera)) + "\n")
-    pack = np.array  # with little-endian types
+    pack = np.array  # used with little-endian types
     count, none = pack([2], "<u8").tobytes(), pack([0], "<u8").tobytes()
     rows = [pack([i + 1], "<u4").tobytes() + pack(pose, "<f8").tobytes() + pack([1], "<u4").tobytes()
             + f"{'ab'[i]}.png".encode() + b"\0" + none for i, pose in enumerate(poses)]  # fmt: skip

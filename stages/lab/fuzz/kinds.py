@@ -92,7 +92,7 @@ class Kind:
 
     name: str
     write: Callable[[Path], object]  # writes the example to a folder
-    changes: Mapping[str, Change]  # by file name; one of the files is changed per case
+    changes: Mapping[str, Change]  # changes by file name; one of the files is changed per case
     read: Callable[[Path], object]  # reads from the folder; raises AssertionError for invalid values
     share: int = 1  # relative frequency of its cases
     repair: Callable[[Path], object] | None = None  # corrects checksums, in 70 % of the cases

@@ -21,7 +21,7 @@ DRAWS, LEVEL = 2000, 95  # number of bootstrap samples, and level of the interva
 class Answers(NamedTuple):
     """The ratings of a study."""
 
-    ratings: dict[str, np.ndarray]  # by scale: (participants, films), 1 to `points`, 0 for none
+    ratings: dict[str, np.ndarray]  # for each scale: array (participants, films) of 1 to `points`, 0 for none
     films: dict[str, dict]  # model, split and file of each film, in column order
     points: int
     missing: int  # number of films shown on the pages of these participants but not answered

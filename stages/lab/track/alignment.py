@@ -35,7 +35,7 @@ class Observation:
     film: int  # index of the film
     late: float  # delay of the image after the time of the poses [frames]
     camera: Camera
-    reduction: int  # of the image
+    reduction: int  # factor by which the image is reduced
     image: Float[Tensor, "h w c"]  # nan where unknown
     displacement: Float[Tensor, "o 6"]  # motion of each object during `late`: rotation [rad], translation [scene units]
 
@@ -54,7 +54,7 @@ class PixelChanges:
 
     row: Tensor  # (p) object in each pixel
     residual: Float[Tensor, "p c"]
-    jacobian: Float[Tensor, "p c 6"]  # of the rendering, by rotation [1/rad] and displacement [1/scene unit]
+    jacobian: Float[Tensor, "p c 6"]  # derivative of the rendering by rotation [1/rad] and displacement [1/scene unit]
 
 
 def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"]) -> PixelChanges:

@@ -38,12 +38,12 @@ STEPS = {4: 3, 2: 2}  # number of Gauss-Newton steps by image reduction, coarse 
 class SoftBody:
     """The deformation nodes of an object, relative to its centre at rest."""
 
-    row: int  # of the object
+    row: int  # row of the object
     nodes: Float[Tensor, "k 3"]
     edges: Int[Tensor, "e 2"]
     gaussians: Bool[Tensor, "n"]  # mask of this object's Gaussians among those of all objects
     index: Int[Tensor, "m j"]  # nodes that each Gaussian of the object follows
-    weight: Float[Tensor, "m j"]  # of these nodes
+    weight: Float[Tensor, "m j"]  # weights of these nodes
 
     @staticmethod
     def of(synthesiser: Synthesiser, row: int) -> SoftBody:

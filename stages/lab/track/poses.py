@@ -20,7 +20,7 @@ class Poses:
     """
 
     rotation: Float[Tensor, "*b o 3 3"]
-    centre: Float[Tensor, "*b o 3"]  # [scene units]
+    centre: Float[Tensor, "*b o 3"]  # centre of each object [scene units]
 
     def __getitem__(self, index) -> Poses:
         """The poses of some frames."""

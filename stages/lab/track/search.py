@@ -38,7 +38,7 @@ AWAY = 1e4  # coordinates of an object that is moved out of view [scene units]
 class Sighting(NamedTuple):
     """An object that was found again."""
 
-    poses: Poses  # of all objects
+    poses: Poses  # poses of all objects
     distinct: bool  # whether the images distinguish the pose from all other rotations that were tried
 
 

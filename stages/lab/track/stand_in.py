@@ -47,8 +47,8 @@ class StandInOptions:
 
     objects: int = 3
     cameras: int = 10
-    width: int = 240  # of the films [px]; the height is three quarters of it
-    frames: int = 50  # from the release on
+    width: int = 240  # width of the films [px]; the height is three quarters of it
+    frames: int = 50  # number of frames from the release on
     fps: float = 50.0
     noise: float = 0.02  # standard deviation of a colour channel (0..1)
     broken: bool = True  # the last film ends half way

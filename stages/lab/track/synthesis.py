@@ -53,9 +53,9 @@ class Synthesis:
 
     image: Float[Tensor, "h w c"]  # RGB, followed by painted labels if there are label images
     label: Int[Tensor, "h w"]  # row of the object, -1: background
-    moving: Int[Tensor, "h w"]  # as `label`, but on outlines the nearest object among the neighbouring pixels
+    moving: Int[Tensor, "h w"]  # like `label`, but on outlines the nearest object among the neighbouring pixels
     point: Float[Tensor, "h w 3"]  # visible point of the object in `moving`, in world coordinates
-    depth: Float[Tensor, "h w"]  # of the object or background in `label`
+    depth: Float[Tensor, "h w"]  # depth of the object or background in `label`
 
 
 class Synthesiser:

@@ -25,7 +25,7 @@ from stages.lab.track.follow import TrackedMotion, Tracker, follow
 from stages.lab.track.options import TrackOptions
 
 log = logging.getLogger(__name__)
-GRAVITY = 9.81  # [m/s^2]
+GRAVITY = 9.81  # acceleration of gravity [m/s^2]
 
 
 def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator[str]:

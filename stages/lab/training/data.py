@@ -29,7 +29,7 @@ MAX_RESTING_SPEED, REST_FRAMES = 0.02, 5
 class MotionClip:
     """A batch of short motions."""
 
-    world: InitialConditions  # at rest, in the first frame of the whole motion
+    world: InitialConditions  # initial conditions at rest, in the first frame of the whole motion
     rest: Any  # the model's precomputed features of `world` (`Dynamics.precompute`)
     points: Float[Tensor, "b o n 3"]  # keypoints at the start of the clip [m]
     speed: Float[Tensor, "b o n 3"]  # their velocities [m/s]

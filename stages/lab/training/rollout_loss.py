@@ -31,7 +31,7 @@ MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # offset and reference value of the sprea
 class LossOptions:
     """Kind and weights of the terms of the loss."""
 
-    kind: str = "square"  # one of LOSSES
+    kind: str = "square"  # name of the position loss, one of LOSSES
     velocity_time: float = 0.0  # weight of velocity errors relative to position errors [s]; 0: no velocity errors
     gradient_discount: float = 1.0  # factor on the gradient per frame; contacts amplify it in backpropagation
 

@@ -54,7 +54,7 @@ class Targets:
     grid: VoxelGrid
     labels: Int[Tensor, "v"]  # majority label of the surfels: -1 floater or clutter, 0 surface, 1... objects
     classes: Int[Tensor, "v"]  # index in CLASSES
-    offsets: Float[Tensor, "v 3"]  # to the centre of the object; 0 elsewhere
+    offsets: Float[Tensor, "v 3"]  # vectors to the centre of the object; 0 elsewhere
     pairs: Int[Tensor, "e 2"]  # pairs of voxels, none of them surface and at least one of an object
 
 

@@ -14,9 +14,9 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, save_tensors
 
-EMA_DECAY = 0.999  # of the exponential moving average of the weights, after a few thousand steps
+EMA_DECAY = 0.999  # decay of the exponential moving average of the weights, after a few thousand steps
 GRADIENT_CLIP = 2.0  # gradients are clipped to this multiple of the moving average of their norm
-GRADIENT_NORM_DECAY = 0.99  # of the moving average of the gradient norm
+GRADIENT_NORM_DECAY = 0.99  # decay of the moving average of the gradient norm
 WARMUP_STEPS = 200  # steps until the full learning rate
 DIVERGENCE_RATIO = 1.25  # training has diverged if the RMSE is this multiple of the lowest so far
 MAX_WORSENING_CHECKS = 4  # training has diverged if this many consecutive validations were each worse than the last
@@ -142,7 +142,7 @@ class TrainingState:
             different = [k for k in key if state["key"].get(k) != key[k]]
             if not different:
                 self._take(state)
-        except torch.cuda.OutOfMemoryError:  # not caused by the file
+        except torch.cuda.OutOfMemoryError:  # the file is not the cause
             raise
         except Exception as error:  # damaged pickles and values of wrong types raise arbitrary exceptions
             raise InputError(f"{path}: cannot be read as a checkpoint of a training; start anew") from error

@@ -125,7 +125,8 @@ class TrainingRun:
     """One training run, by one or several processes."""
 
     state: TrainingState
-    samplers: list[ClipSampler]  # with all keypoints, optionally followed by one with fewer for every fourth step
+    # samplers with all keypoints, optionally followed by one with fewer for every fourth step
+    samplers: list[ClipSampler]
     validation: KeypointMotions
     options: TrainOptions
     processes: ProcessGroup

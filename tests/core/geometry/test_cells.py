@@ -6,7 +6,7 @@ import torch
 from stages.core.geometry.cells import distinct_cells
 
 
-@pytest.mark.parametrize("reach", [1, 5, 2**40])  # with the last reach, a row cannot be packed into one integer
+@pytest.mark.parametrize("reach", [1, 5, 2**40])  # a row with the last reach does not fit into one integer
 @pytest.mark.parametrize("dimensions", [1, 2, 3])
 def test_as_unique_rows(reach, dimensions, device):
     cells = torch.randint(-reach, reach + 1, (400, dimensions), generator=torch.Generator().manual_seed(0)).to(device)

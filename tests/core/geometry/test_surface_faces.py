@@ -20,7 +20,7 @@ def box_points(spacing: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
 def test_faces_of_a_box_at_its_faces_edges_and_corners():
     points, normals = box_points()
     flatness, faces = surface_faces(points, normals)
-    meeting = np.isclose(np.abs(points), SIDES / 2)  # which of the three faces each point is on
+    meeting = np.isclose(np.abs(points), SIDES / 2)  # whether each point is on each of the three faces
     count = meeting.sum(1)
     inner = (np.abs(points) < SIDES / 2 - 0.11).sum(1) == 2  # points in the interior of a face
     assert inner.sum() > 500 and (flatness[inner] == pytest.approx(1)) and not flatness[count > 1].any()
@@ -33,7 +33,7 @@ def test_faces_of_a_box_at_its_faces_edges_and_corners():
         assert ((np.linalg.norm(found, axis=2) > 0).sum(1) == k).all()
         there = np.where(meeting, np.sign(points), 0.0)[mine]
         assert np.abs(found).max(1) == pytest.approx(np.abs(there))  # each axis occurs once
-        assert found.sum(1) == pytest.approx(there)  # with the right sign
+        assert found.sum(1) == pytest.approx(there)  # the sign must be right too
 
 
 def test_points_of_a_sheet_are_on_the_face_of_their_side():

@@ -11,7 +11,7 @@ from stages.core.geometry.symmetric_matrices import BATCH, PAIRS, eigh, least_di
 
 
 def test_more_matrices_than_the_solver_takes_at_once(device):
-    count = 2_000_003 if device == "cuda" else BATCH + 3  # on a GPU, as many as the voxels of a large scene
+    count = 2_000_003 if device == "cuda" else BATCH + 3  # the larger number is that of the voxels of a large scene
     A = torch.rand(count, 3, 3, generator=torch.Generator().manual_seed(0)).to(device) - 0.5
     A = A + A.mT
     values, vectors = eigh(A)
@@ -22,7 +22,7 @@ def test_more_matrices_than_the_solver_takes_at_once(device):
 
 @pytest.mark.gpu
 def test_first_calls_of_threads():
-    """In a new process, because PyTorch loads the solver on the first call."""
+    """It runs in a new process, because PyTorch loads the solver on the first call."""
     subprocess.run([sys.executable, "-c", """
 import threading, torch
 from stages.core.geometry.symmetric_matrices import eigh

@@ -13,7 +13,7 @@ from stages.lab.assets.shapes import ellipsoid
 
 @pytest.mark.parametrize("sides", [(0.3, 0.2, 0.1), (0.2, 0.2, 0.1), (0.1, 0.2, 0.4)])
 def test_of_a_box_turned_about_the_vertical(sides):
-    """The axis-aligned bounding box of a box with sides .3, .2 and .1 would have sides up to .36."""
+    """The axis-aligned bounding box of a box with sides 0.3, 0.2 and 0.1 would have sides up to 0.36."""
     points = torch.cartesian_prod(*(torch.tensor([0.0, side], dtype=torch.float64) for side in sides))
     lengths = [longest_side(points @ turned(angle)) for angle in np.linspace(0, 7, 20)]
     np.testing.assert_allclose(lengths, max(sides), rtol=1e-9)

@@ -34,8 +34,8 @@ class Contacts(NamedTuple):
     a: Int[Tensor, "r"]
     b: Int[Tensor, "r"]
     fixed: Tensor  # r; whether the other side is a fixed surface
-    normal: Float[Tensor, "r 3"]  # from b to a
-    arm_a: Float[Tensor, "r 3"]  # from the centre of mass to the contact point [m]
+    normal: Float[Tensor, "r 3"]  # contact normals from body b to body a
+    arm_a: Float[Tensor, "r 3"]  # vector from the centre of mass to the contact point [m]
     arm_b: Float[Tensor, "r 3"]
     target: Float[Tensor, "r"]  # smallest normal speed of a relative to b after the step [m/s]
     friction: Float[Tensor, "r"]
@@ -44,7 +44,7 @@ class Contacts(NamedTuple):
 class BodyInertia(NamedTuple):
     """Inertia of the bodies in world axes, and their velocities without contact."""
 
-    mass: Float[Tensor, "o"]  # [kg]
+    mass: Float[Tensor, "o"]  # mass of each object [kg]
     inertia: Float[Tensor, "o 3 3"]  # about the centres of mass [kg m^2]
     inverse: Float[Tensor, "o 3 3"]
     velocity: Float[Tensor, "o 6"]  # linear, of the centres of mass [m/s], then angular [rad/s]

@@ -76,7 +76,7 @@ DT, G, MASS = 0.005, 5.0, 2.0
 
 
 def box_on_floor(device, speed, friction, tilt=0.0):
-    """One step of a box of .3 x .3 x .2 m with 49 contacts on its lower face; gravity is tilted by `tilt` about y."""
+    """One step of a box of 0.3 x 0.3 x 0.2 m with 49 contacts below it; gravity is tilted about y by `tilt`."""
     line = torch.linspace(-0.15, 0.15, 7).double()
     arm = torch.cat([torch.cartesian_prod(line, line), torch.full((49, 1), -0.1).double()], 1)
     zero, inertia = torch.zeros(49, dtype=torch.int64), MASS * torch.tensor([0.0108, 0.0108, 0.015]).double().diag()
@@ -120,7 +120,7 @@ def test_the_impulse_is_in_the_friction_cone(device, speed):
 
 
 def two_balls(device, pinned):
-    """Balls of 1 and 3 kg in an off-centre collision, whose target speed of separation is .6 m/s."""
+    """Balls of 1 and 3 kg in an off-centre collision with a target speed of separation of 0.6 m/s."""
     mass, radius = torch.tensor([1.0, 3.0]).double(), 0.1
     inertia = 0.4 * mass[:, None, None] * radius**2 * torch.eye(3).double()
     velocity = torch.zeros(2, 6).double()

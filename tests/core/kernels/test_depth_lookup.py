@@ -59,7 +59,7 @@ def test_kernels_agree_with_numpy(counts):
 
 
 def test_the_normal_is_that_of_the_flatter_of_parallel_faces_else_of_the_sample_on_a_face():
-    """A sample on top of one body lies .02 inside the underside of another, whose nearest sample is the second one."""
+    """A sample on top of one body is 0.02 inside the underside of another, whose nearest sample is the second one."""
     line = np.arange(-0.2, 0.21, 0.1)
     height = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., 2]
     up, aslant = np.array([0.0, 0, 1]), np.array([0.0, 0.28, 0.96])
@@ -93,7 +93,7 @@ def test_distances_and_contacts_of_a_ball(make):
     x = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
     ball = 1 - np.linalg.norm(x, axis=-1)
     at_edges = np.zeros((3, 3, 3)), np.full(2 * ball.size, -1)
-    points = np.array([[0.0, -1.1, 0], [0, -0.5, 0], [0, 5, 0]])  # at x = 1.1, .5 and -5 in world coordinates
+    points = np.array([[0.0, -1.1, 0], [0, -0.5, 0], [0, 5, 0]])  # x = 1.1, 0.5 and -5 in world coordinates
     samples = Samples(points, np.array([[0.0, -1, 0]] * 3), np.zeros(3), *at_edges)
     lookup = make([ball, ball], np.full((2, 3), -1.2), np.full(2, 0.05), samples)
     turn = np.stack([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], np.eye(3)])

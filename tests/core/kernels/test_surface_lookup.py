@@ -74,7 +74,7 @@ def test_of_a_polyhedron(device):
 
 
 def test_of_a_torus_on_a_grid(device):
-    """From outside and from the hole. Grid gradients have an error of half the spacing over the curvature radius."""
+    """Points are outside or in the hole. Grid gradients have an error of half the spacing over the curvature radius."""
     spacing, ring, tube = 0.02, 0.5, 0.2
     low = torch.tensor([-0.8, -0.8, -0.3])
     nodes = torch.stack(torch.meshgrid(*(torch.arange(n) for n in (81, 81, 31)), indexing="ij"), -1)

@@ -16,7 +16,7 @@ from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.pins import OUTSIDE, face_nodes
 from stages.core.physics.mpm.split import SplitSubsteps
 
-# of the beam: width and length [m], Young's modulus [Pa], density [kg/m^3]
+# width and length [m], Young's modulus [Pa] and density [kg/m^3] of the beam
 SIDE, LENGTH, E, DENSITY = 0.1, 0.5, 2e5, 500.0
 
 
@@ -82,7 +82,7 @@ def test_a_beam_bends_as_if_it_were_clamped_at_the_face_of_the_pinned_part(n, de
     nu = 0.2
     turn, omega = rotation(degrees, (1.0, 1.0, 1.0)), 3.516 * math.sqrt(E / DENSITY / 12) * SIDE / LENGTH**2
     sag, dx = tip_displacement(n, nu, turn, shift, (0.0, 0.0, -0.5), omega, device)
-    load = 0.5 * DENSITY * SIDE**2  # [N/m]
+    load = 0.5 * DENSITY * SIDE**2  # weight per length [N/m]
     a, b = load / (8 * E * SIDE**4 / 12), load / (2 * 5 / 6 * E / (2 * (1 + nu)) * SIDE**2)
     length = math.sqrt((math.sqrt(b**2 + 4 * a * sag) - b) / (2 * a))
     assert length == pytest.approx(LENGTH, abs=(0.3 if degrees else 0.2) * dx)

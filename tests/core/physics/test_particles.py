@@ -313,7 +313,7 @@ def voxels(shape, *blocks) -> np.ndarray:
 
 def test_specks_smaller_than_a_fiftieth_are_removed():
     large, speck, single = ((1, 1, 1), (4, 5, 5)), ((8, 1, 1), (8, 1, 2)), ((8, 8, 8), (8, 8, 8))
-    body = voxels((10, 10, 10), large, speck, single)  # of 100, 2 and 1 voxels
+    body = voxels((10, 10, 10), large, speck, single)  # the blocks have 100, 2 and 1 voxels
     assert np.array_equal(body_filling._largest(body), voxels(body.shape, large, speck))
     touching = voxels((10, 10, 10), large, ((5, 6, 6), (5, 6, 6)))  # they touch at a corner
     assert np.array_equal(body_filling._largest(touching), touching)

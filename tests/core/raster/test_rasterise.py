@@ -18,7 +18,7 @@ from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
 
 devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-EYE = look_at(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(3))  # looks along -x; right is +y, up is +z
+EYE = look_at(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(3))  # faces -x; right is +y, up is +z
 SIZE, FOCAL = 41, 50.0  # an odd size, so that the optical axis passes through the centre of pixel (20, 20)
 K = intrinsics(SIZE, SIZE, FOCAL)
 

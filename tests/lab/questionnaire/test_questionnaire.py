@@ -214,7 +214,7 @@ def test_intervals_and_agreement_of_noisy_participants(films, tmp_path):
         width = 2 * 1.96 * (2 / 3) ** 0.5 / 4 / sum(row["counts"]) ** 0.5
         assert 0.9 * width < row["high"] - row["low"] < 1.1 * 3**0.5 * width
     phys, photo = table["alpha"]["PhysR"]["interval"], table["alpha"]["PhotoR"]["interval"]
-    # the variance is 0.25 between films (5 and 4 of 9, one point apart) and 2/3 within: alpha = .247 / (.247 + .667)
+    # the variance is 0.25 between films (5 and 4 of 9, one point apart) and 2/3 within: alpha = 0.247 / (0.247 + 0.667)
     assert phys["alpha"] == pytest.approx(0.27, abs=0.08) and phys["low"] < 0.27 < phys["high"]
     assert abs(photo["alpha"]) < 0.05
 

@@ -20,8 +20,8 @@ class Specimen:
     """A body and its material."""
 
     surface: Surface
-    E: float = 1e7  # [Pa]
-    density: float = 540.0  # [kg/m^3]
+    E: float = 1e7  # Young's modulus [Pa]
+    density: float = 540.0  # density [kg/m^3]
     loss: float = 0.15  # loss factor
 
     def material(self) -> dict:
@@ -125,7 +125,7 @@ def tilted(surface: Surface, degrees: float) -> Surface:
 
 
 def on_slope(degrees: float, loss: float, options: Mapping, body: Surface | None = None) -> Run:
-    """A body (default: a box of .2 x .2 x .1 m) at rest on a pinned slope 2 m long; the body is given at the origin."""
+    """A body (default: a box of 0.2 x 0.2 x 0.1 m) at rest on a pinned slope of 2 m; it is given at the origin."""
     ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
     body = box((0.2, 0.2, 0.1), 0.008).moved((0, 0, 0.05)) if body is None else body
     body = tilted(body.moved((-0.5, 0, 0)), degrees).moved((0, 0, 1.2))

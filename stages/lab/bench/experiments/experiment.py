@@ -24,9 +24,9 @@ class Experiment:
     runs: tuple[Run, ...]
     measure: Callable[..., float]  # function of the trajectories of the runs
     value: float  # analytic
-    what: str  # name and unit of the measured quantity
+    what: str  # value predicted by theory
     scale: float  # error that counts as 1
-    tolerance: Mapping  # by engine: largest error, or lowest and highest signed error
+    tolerance: Mapping  # for each engine: largest error, or lowest and highest signed error
 
     def passes(self, engine: str, measured: float) -> bool:
         """Whether a value agrees with theory within the tolerance of the engine."""

@@ -201,7 +201,7 @@ def levers() -> Iterator[Experiment]:
 def creep() -> Iterator[Experiment]:
     """A box held by friction on a slope for ten seconds."""
     for loss in (0.02, 0.15):
-        run = on_slope(15, loss, {"friction": 0.3, "steps": 501})  # tan 15 degrees is .268
+        run = on_slope(15, loss, {"friction": 0.3, "steps": 501})  # tan 15 degrees is 0.268
         yield Experiment(f"creep/15deg friction=0.3 loss={loss:g}", (run,),
                          lambda t: 1e4 * float((t.com[-1, 1] - t.com[25, 1]).norm()) / 0.2, 0.0,
                          "distance from .5 to 10 s [1e-4 sides]", 1.0, dict.fromkeys(TOLERANCES, 1.0))  # fmt: skip

@@ -27,7 +27,7 @@ def falls() -> Iterator[Experiment]:
 
 
 def torques() -> Iterator[Experiment]:
-    """A torque and a force, each applied for .2 s, on a box and a ball in free space."""
+    """A torque and a force, each applied for 0.2 s, on a box and a ball in free space."""
     density, side, radius = 540.0, 0.3, 0.15
     mass = {"box": density * side**3, "ball": density * 4 / 3 * math.pi * radius**3}
     inertia = {"box": mass["box"] * side**2 / 6, "ball": 0.4 * mass["ball"] * radius**2}
@@ -97,7 +97,7 @@ def rebounds() -> Iterator[Experiment]:
 
 
 def bounces() -> Iterator[Experiment]:
-    """A ball falls .5 m with a horizontal speed: friction takes mu (1 + e) times its normal speed, until it rolls."""
+    """A ball falls 0.5 m with a horizontal speed: friction takes mu (1 + e) times its normal speed, until it rolls."""
     for loss, mu in product((0.02, 0.15), (0.1, 0.5)):
         body = replace(ball(0.15, (0, 0, 0.15)), loss=loss)
         run = Run((body,), {"lift": ("0.5",), "velocity": ("object=1 3,0,0",), "friction": mu, "dt": 0.01, "steps": 61})

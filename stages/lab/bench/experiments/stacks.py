@@ -44,7 +44,7 @@ def piles() -> Iterator[Experiment]:
                      "height of its middle [radii]", 1.0, TOLERANCES)  # fmt: skip
     places = ((-0.1, 0.1), (0.1, 0.1), (0.0, 0.1 + 0.1 * math.sqrt(3)))
     logs = tuple(Specimen(cylinder(0.1, 0.3, 0.01).moved((x, 0, z)), loss=0.02) for x, z in places)
-    # the contact forces between logs are 15 degrees from the normal, whose tangent is .268
+    # the contact forces between logs are 15 degrees from the normal; the tangent is 0.268
     yield Experiment("pile/three logs", (Run(logs, {"friction": 0.3}),), lambda t: float(-path(t, 2)[-1, 2]) / 0.1, 0.0,
                      "fall of the upper one in 2 s [radii]", 1.0, TOLERANCES)  # fmt: skip
     for count in (20, 40):

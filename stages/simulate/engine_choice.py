@@ -37,9 +37,11 @@ def with_engine(
     object is soft if its own weight and the load on it, or a force of the prompts, compress it by more than
     MAX_RIGID_SAG; if an impact, at the speed that the prompts give it or of an object that falls on it, compresses it
     by more than MAX_RIGID_IMPACT; or if it is a sheet or rod off the floor that bends by more than MAX_RIGID_DROOP.
-    The learned engine replaces MPM for soft objects where MPM is not suitable: in live sessions, and for objects of
-    photos that are held at rest. It does not if the prompts move an object sideways or only an impact deforms it, since
-    learned contacts have almost no friction and restitution.
+    An object whose material is not known counts as rigid.
+
+    In live sessions, and for objects of photos that are held at rest, MPM is not suitable. There the learned engine
+    replaces it, unless the prompts move an object sideways, since learned contacts have almost no friction; and rigid
+    bodies replace it if only impacts deform objects, since learned contacts have almost no restitution.
 
     Contacts of the learned engine are learned if weight compresses an object by more than MAX_SOLVED_SAG and the
     prompts move no object sideways; with an integrator, since solved contacts have no rate of change; and with given
@@ -78,9 +80,10 @@ def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
         engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
     elif uneven:
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
-    elif lasting and not sideways and (options.live or held):
+    elif reasons and (options.live or held) and not (lasting and sideways):
         unlike = "is slower than live sessions" if options.live else "does not hold objects of photos at rest"
-        engine, reason = "ngff", f"{lasting[0].text}, and --engine mpm {unlike}"
+        engine = "ngff" if lasting else "rigid"
+        reason = f"{(lasting or reasons)[0].text}, and --engine mpm {unlike}"
     elif reasons:
         engine, reason = "mpm", (lasting or reasons)[0].text
     else:
@@ -154,7 +157,12 @@ class _Reason(NamedTuple):
 
 
 def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: float) -> _Reason | None:
-    """Why an object deforms too much to count as rigid; None if it is rigid. `others` may press on it or hit it."""
+    """Why an object deforms too much to count as rigid; None if it is rigid or its material is not known.
+
+    `others` may press on it or hit it.
+    """
+    if block.guessed:
+        return None
     m, height, g = block.material, float(block.sides[2]), abs(gravity)
     above = [other for other in others if other is not block and other.is_above(block)]
     load = g * sum(other.mass / min(other.base, block.base) for other in above)  # [Pa]
@@ -168,7 +176,7 @@ def _deformed(block: _Block, others: Sequence[_Block], floor: float, gravity: fl
     if block.force / (m.E * least_face) > MAX_RIGID_SAG:
         return _Reason(f"object {block.id} is compressed by more than {MAX_RIGID_SAG:.0%} by a force on it", False)
     off_floor = block.low[2] - floor > block.extents[0]
-    if off_floor and not block.guessed and droop(m, block.extents, g) > MAX_RIGID_DROOP:
+    if off_floor and droop(m, block.extents, g) > MAX_RIGID_DROOP:
         return _Reason(f"object {block.id} is so thin that it bends under its own weight", False)
     if max(impact(m, block.speed), *hits, 0.0) > MAX_RIGID_IMPACT:
         return _Reason(f"an impact compresses object {block.id} by more than {MAX_RIGID_IMPACT:.0%}", True)

@@ -50,6 +50,23 @@ def test_what_an_impact_compresses_is_soft(speed, lift, engine):
     assert impact(Material(E=8e5, density=600.0), 3.651) == pytest.approx(0.1, rel=1e-3)
 
 
+@pytest.mark.parametrize("why", ["photos", "live"])
+def test_impacts_alone_do_not_take_mpm_where_it_is_not_suitable(why):
+    scene = two_balls_scene()
+    scene = replace(scene, provenance={"command": "reconstruct"}) if why == "photos" else scene
+    options, prompts = SimulateOptions(material=("1=ball",), live=why == "live"), ForcePrompts(lift={1: 0.7})
+    assert with_engine(options, scene, choose_keypoints(scene, 32), prompts).engine == "rigid"
+
+
+@pytest.mark.parametrize(("named", "engine"), [("rubber", "mpm"), ("", "rigid")])
+def test_what_is_not_known_is_rigid(named, engine):
+    """At 100 m/s rubber and the default material are both compressed by more than 10 %."""
+    scene = two_balls_scene()
+    scene = replace(scene, objects=tuple(replace(o, name=f"object {o.id}", material=named) for o in scene.objects))
+    prompts = ForcePrompts(velocity={1: (0.0, 0.0, -100.0)})
+    assert with_engine(SimulateOptions(), scene, choose_keypoints(scene, 32), prompts).engine == engine
+
+
 @pytest.mark.parametrize(("material", "prompts", "engine"), [
     ("pillow", ForcePrompts(velocity={2: (0.0, 0.5, 0.0)}), "mpm"),
     ("pillow", ForcePrompts((Force(2, force=(0.1, 0.0, 0.0)),)), "mpm"),

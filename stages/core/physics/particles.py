@@ -60,6 +60,7 @@ class Bodies:
     body: Int[Tensor, "p"]  # index into scene.objects
     volume: Float[Tensor, "p"]
     spacing: float  # edge of a voxel; without `skin`, particles of thick bodies stay this far inside the surface
+    extended: frozenset[int] = frozenset()  # indices of the objects that are extended down to the floor
 
 
 @cached_in_scene
@@ -87,11 +88,11 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     points = [(v + 0.5 + 0.5 * (rng.random(v.shape) - 0.5)) * h for v in voxels]
     body = torch.arange(len(points)).repeat_interleave(torch.tensor([len(p) for p in points]))
     volume = h**3 * torch.tensor([ratio for _, ratio, _ in solids])[body]
-    for o, (_, _, extended) in zip(scene.objects, solids, strict=True):
-        if extended:
-            log.info("object %d (%s) stood in the photos but would tip over as reconstructed; its unseen part is "
-                     "extended down to the floor (see also `ngff refine`)", o.id, o.name)  # fmt: skip
-    return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h)
+    extended = frozenset(row for row, solid in enumerate(solids) if solid[2])
+    for o in (scene.objects[row] for row in sorted(extended)):
+        log.info("object %d (%s) stood in the photos but would tip over as reconstructed; its unseen part is "
+                 "extended down to the floor (see also `ngff refine`)", o.id, o.name)  # fmt: skip
+    return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h, extended)
 
 
 def scene_size(scene: Scene) -> float:

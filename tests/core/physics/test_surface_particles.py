@@ -13,6 +13,7 @@ from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
 from stages.lab.bench.experiments.bodies import tilted
+from stages.lab.bench.experiments.friction import ladders
 from tests.conftest import ball
 
 SIDES = torch.tensor([0.4, 0.3, 0.2])
@@ -35,6 +36,20 @@ def test_volume_and_second_moments_of_an_inclined_box(degrees, refinement):
     x = x - (w[:, None] * x).sum(0) / w.sum()
     moments = torch.linalg.eigvalsh((w[:, None] * x).mT @ x / w.sum())
     torch.testing.assert_close(moments, (SIDES.double() ** 2 / 12).sort().values, rtol=0.06, atol=0)
+
+
+@pytest.mark.parametrize("refinement", [1, 2])
+@pytest.mark.parametrize("count", [6000, 20000])
+def test_a_leaning_board_has_no_particles_outside_its_faces(count, refinement):
+    """A board of 1 x 0.2 x 0.06, six voxels of its surface thick, on a wall, towards which its voxels are closed."""
+    scene, a = next(ladders()).runs[0].scene(), math.radians(60.0)
+    bodies = surface_particles(scene, sample_bodies(scene, count, skin=True), refinement)
+    x, w = bodies.x[bodies.body == 1], bodies.volume[bodies.body == 1]
+    back = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
+    sides, seen = torch.tensor([1.0, 0.2, 0.06]), scene.gaussians.means[scene.gaussians.object_id == 2]
+    outside = ((x - (seen.amin(0) + seen.amax(0)) / 2) @ back).abs() - sides / 2
+    assert float(outside.max()) < 2 * bodies.spacing
+    assert float(w.sum()) == pytest.approx(float(sides.prod()), rel=0.05)
 
 
 @pytest.mark.parametrize("degrees", [10.0, 25.0])

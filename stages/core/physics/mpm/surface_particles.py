@@ -2,14 +2,17 @@
 
 At the surface of a thick body, a particle carries only the volume of the filled part of its voxel, which follows from
 the signed distance to the planes fitted to the surface samples (`solid_surface.py`). With whole voxels, an inclined
-surface would be a staircase, and two such surfaces would interlock. Sheets, and parts that the surface does not
-enclose, keep whole voxels.
+surface would be a staircase, and two such surfaces would interlock. Sheets, and the parts by which a body is extended
+down to the floor, keep whole voxels.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
+from scipy import ndimage
 
 from stages.core.physics.morphology import surrounded
 from stages.core.physics.particles import Bodies
@@ -18,7 +21,7 @@ from stages.core.scene.scene import Scene
 
 MIN_FRACTION = 0.1  # filled fraction of a voxel below which it has no particle
 THICK = 0.75  # depth below the surface reached only in parts thicker than sheets [voxels of `bodies`]
-SHEET = 2.5  # largest depth in sheets, which the surface's own voxels thicken to three [voxels of the surface]
+SHEET = 2.25  # depth below the surface not reached in sheets or parts of up to four voxels [voxels of the surface]
 
 
 def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: int = 0) -> Bodies:
@@ -31,7 +34,13 @@ def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: i
     voxels = np.floor(bodies.x.double().numpy() / bodies.spacing).astype(np.int64)
     filled = _without_overlap(
         [
-            _filled(voxels[(bodies.body == row).numpy()], refinement, h, solid_surface(scene, o.id, seed).fitted)
+            _filled(
+                voxels[(bodies.body == row).numpy()],
+                refinement,
+                h,
+                solid_surface(scene, o.id, seed).fitted,
+                row in bodies.extended,
+            )
             for row, o in enumerate(scene.objects)
         ]
     )
@@ -42,8 +51,14 @@ def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: i
     return Bodies(torch.from_numpy(np.concatenate(x)).float(), body, volume, h)
 
 
-def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Cells (m, 3) of edge h in and at a body of voxels, and their filled fractions (m,)."""
+def _filled(
+    voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface, extended: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells (m, 3) of edge h in and at a body of voxels, and their filled fractions (m,).
+
+    Thick parts are the cells inside the surface within sqrt(3) core depths of a core of that depth, which reaches the
+    corners of boxes, and the cells outside the surface next to them. In an `extended` body whole voxels stay below it.
+    """
     low = voxels.min(0) - 2
     body = np.zeros(voxels.max(0) - low + 3, bool)
     body[tuple((voxels - low).T)] = True
@@ -53,7 +68,13 @@ def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface
     near = surrounded(body, refinement)
     depth = np.full(body.shape, -np.inf)
     depth[near] = surface.depth((np.argwhere(near) + low + 0.5) * h) / h
-    thick = surrounded(depth > max(THICK * refinement, SHEET * surface.h / h), 2 + refinement)
+    core = max(THICK * refinement, SHEET * surface.h / h)
+    inside = depth > 0
+    thick = surrounded(depth > core, math.ceil(math.sqrt(3) * core)) & inside
+    if inside.any():
+        thick = thick[tuple(ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True))]
+    if extended:
+        thick &= inside | ~np.logical_or.accumulate(inside[:, :, ::-1], 2)[:, :, ::-1]
     fraction = np.where(thick, (depth + 0.5).clip(0, 1), body)
     fraction[fraction < MIN_FRACTION] = 0
     cells = np.argwhere(fraction)

@@ -30,7 +30,8 @@ from stages.simulate.rigid_model import OMEGA
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; from a fall of 0.5 % of the smallest size
 MAX_TURNS = 20  # rounds of impacts; a light body between heavy ones would need hundreds: the last has all contacts
 APART = -1e9  # reference acceleration that disables a contact
-MAX_PASSES = 8  # passes for exact friction; each reduces the error of a sliding box by a factor mu^2 / (1 + mu^2)
+MAX_PASSES = 16  # passes for exact friction
+MIXED = 3  # earlier passes whose differences extrapolate to the next slip
 SLIP_TOLERANCE = 0.01  # of the normal acceleration of a contact, relative to gravity plus that acceleration
 REBOUND_TOLERANCE = 0.001  # of the normal acceleration of a contact that rebounds, relative to that acceleration
 
@@ -112,15 +113,32 @@ def solve(mujoco, model, data, normal: np.ndarray, friction: np.ndarray, rebound
     slip = np.linalg.norm(data.efc_aref[along], axis=1)  # slip speed after the substep, divided by the timestep
     slip = np.maximum(slip - friction * np.maximum(wanted + 1, 0), 0)  # initial guess: that of a single sliding box
     rate, lack = np.zeros(data.nefc), np.zeros(len(normal))
+    tried, errors = [], []
     for _ in range(MAX_PASSES):
         data.efc_aref[normal] = wanted + lack - friction * slip
         mujoco.mj_fwdConstraint(model, data)
         mujoco.mj_mulJacVec(model, data, rate, data.qacc)
-        before, slip = slip, np.linalg.norm(rate[along] - data.efc_aref[along], axis=1)
-        error, pressing = friction * np.abs(slip - before), data.efc_force[normal] > 0
+        tried.append(slip)
+        errors.append(np.linalg.norm(rate[along] - data.efc_aref[along], axis=1) - slip)
+        error, pressing = friction * np.abs(errors[-1]), data.efc_force[normal] > 0
         missing = np.where(rebounds & pressing, wanted - rate[normal], 0)
         lack += missing
         touching = pressing | (rate[normal] < wanted)
         inexact = (touching & (error > SLIP_TOLERANCE * (1 + np.abs(wanted)))).any()
         if not inexact and not (np.abs(missing) > REBOUND_TOLERANCE * np.abs(wanted)).any():
             break
+        slip = np.maximum(next_argument(tried[-MIXED - 1 :], errors[-MIXED - 1 :]), 0)
+
+
+def next_argument(tried: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
+    """What to try next, to find the argument (k,) at which a function has its argument as value.
+
+    `errors` are the values less the arguments that were `tried`, the latest last. By Anderson's mixing: repeating the
+    function alone goes on to and fro where a body is wedged between others, as a ball in a groove. Source: Walker and
+    Ni 2011, "Anderson acceleration for fixed-point iterations".
+    """
+    if len(tried) == 1:
+        return tried[0] + errors[0]
+    argument, error = (np.stack([x[-1] - before for before in x[:-1]], 1) for x in (tried, errors))
+    mix = np.linalg.lstsq(error, errors[-1], rcond=1e-8)[0]
+    return tried[-1] + errors[-1] - (argument + error) @ mix

@@ -581,22 +581,48 @@ def test_fast_contacts_rebound_within_a_substep_and_slow_ones_are_pushed_apart()
     assert data.efc_aref[normal + 1].tolist() == [-100.0] * 6 and (data.efc_aref[normal + 2] == 200.0).all()
 
 
-@pytest.mark.parametrize(("slips", "passes"), [([3.0] * 9, 2), ([3.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5], 4),
-                                               (list(range(1, 10)), MAX_PASSES)])  # fmt: skip
-def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
-    """A contact that slides at these speeds after the passes; each pass subtracts friction times the last slip."""
+def passes(slip_after) -> list[float]:
+    """The slips that the passes of the solver take, of a contact that slides at `slip_after(slip)` after a pass."""
     taken: list[float] = []
 
     def constraint(model, data):
-        taken.append(float(data.efc_aref[0]))
+        taken.append((2.0 - float(data.efc_aref[0])) / 0.5)  # friction times the slip is taken off the reference
 
     def rates(model, data, rate, qacc):
-        rate[1:] = 0.6 * slips[len(taken) - 1], 0.8 * slips[len(taken) - 1]
+        rate[1:] = 0.6 * slip_after(taken[-1]), 0.8 * slip_after(taken[-1])
 
     mujoco = SimpleNamespace(mj_fwdConstraint=constraint, mj_mulJacVec=rates)
     data = SimpleNamespace(efc_aref=np.array([2.0, 0.0, 0.0]), efc_force=np.ones(3), nefc=3, qacc=None)
     solve(mujoco, None, data, np.array([0]), np.array([0.5]), np.array([False]))
-    assert taken == pytest.approx([2.0, *(2.0 - 0.5 * s for s in slips[: passes - 1])])
+    return taken
+
+
+@pytest.mark.parametrize("slope", [0.5, -0.5, -1.0])
+def test_passes_of_the_solver_find_the_slip_at_once_where_it_is_linear(slope):
+    """Repeating alone alternates for ever, or diverges, with a slope of -1, as of a body in a groove."""
+    assert passes(lambda slip: 3 + slope * slip) == pytest.approx([0.0, 3.0, 3 / (1 - slope)])
+
+
+def test_passes_of_the_solver_end_when_the_slip_is_known():
+    assert passes(lambda slip: 3.0) == pytest.approx([0.0, 3.0])
+    assert len(passes(lambda slip: slip + 1)) == MAX_PASSES
+
+
+def test_a_ball_rolls_down_a_groove_without_sinking_into_it(tmp_path):
+    """Of 90 degrees: a = g sin(slope) / (1 + 2/5 r^2 / d^2), as the axis of its turn is d = r / sqrt(2) away."""
+    radius, slope, time, lift = 0.06, math.radians(10), 0.9, 0.005
+    half = box((1.4, 0.3, 0.1), 0.012)
+    turns = (torch.tensor([[1.0, 0, 0], [0, c, -s * c], [0, s * c, c]]) for s, c in ((-1, 0.5**0.5), (1, 0.5**0.5)))
+    walls = [Surface(half.moved((0, side * 0.15, -0.05)).points @ R.mT, half.normals @ R.mT)
+             for side, R in zip((-1, 1), turns, strict=True)]  # fmt: skip
+    ball = ellipsoid((radius,) * 3, 2000).moved((-0.5, 0, math.sqrt(2) * radius))
+    bodies = [tilted(body, 10).moved((0, 0, 0.4)) for body in (*walls, ball)]
+    t = roll(tmp_path, *bodies, pin=("1", "2"), lift=(f"3={lift}",), friction=0.8, loss=0.1, steps=46)
+    way = t.com[-1, 2] - t.com[0, 2] + torch.tensor([0.0, 0.0, lift])
+    along = torch.tensor([math.cos(slope), 0.0, -math.sin(slope)])
+    # the loss of its material takes some of it
+    assert float(way @ along) == pytest.approx(G * math.sin(slope) / 1.8 * time**2 / 2, rel=0.03)
+    assert float((way - (way @ along) * along).norm()) < 0.01 * radius
 
 
 @pytest.mark.parametrize("error", [RuntimeError("Caught an unknown exception!"), ValueError("Error: qhull error")])

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.threads import parallel_map
-from stages.core.physics.particles import inliers, usable
+from stages.core.physics.particles import connected, usable
 from stages.core.physics.signed_distance import distance_grid, mass_properties
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
@@ -38,7 +38,7 @@ def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidB
     def body(object_id: int) -> SolidBody:
         mine = (g.object_id == object_id) & g.means.isfinite().all(1)
         surface = g.means[mine & good] if bool((mine & good).any()) else g.means[mine]
-        grid = distance_grid(surface[inliers(surface)].to(device), sheet)
+        grid = distance_grid(surface[connected(surface)].to(device), sheet)
         volume, centre, inertia = mass_properties(grid)
         return SolidBody(volume, centre.cpu(), inertia.cpu())
 

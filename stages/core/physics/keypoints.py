@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
 from stages.core.kernels.threads import parallel_map
-from stages.core.physics.particles import inliers, usable
+from stages.core.physics.particles import connected, usable
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints
 
@@ -61,7 +61,7 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
             means = g.means[mine & g.means.isfinite().all(1)]
         if not len(means):
             return means
-        body = means[inliers(means)]
+        body = means[connected(means)]
         means = means if _is_point(body) else body
         if len(means) > MAX_CANDIDATES:
             order = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))

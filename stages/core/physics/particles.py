@@ -22,7 +22,7 @@ from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.geometry.neighbours import knn
+from stages.core.geometry.neighbours import KDTree, knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
@@ -139,7 +139,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
                 "(not finite, or transparent); label the scene again with `ngff segment`"
             )
         return means.double().numpy()
-    good = good[inliers(good.means)]
+    good = good[connected(good.means)]
     means = good.means.double()
     size = float((means.amax(0) - means.amin(0)).norm())
     gap = _spacing(means) or size / 50
@@ -161,6 +161,24 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
     middle = distance.median()
     spread = (distance - middle).abs().median()
     return 0.6745 * (distance - middle) <= MAX_OUTLIER_SCORE * spread.clamp_min(1e-12 + 1e-3 * float(middle))
+
+
+def connected(points: Float[Tensor, "n 3"]) -> Tensor:
+    """Mask of the `inliers` and of what is connected to them, as the tip of a cone or a long handle.
+
+    Points are linked up to the radius of the largest hole of a closed surface, within which they have a neighbour.
+    """
+    kept = inliers(points)
+    if bool(kept.all()):
+        return kept
+    near = points[kept].double()
+    link = max(largest_hole(near) / 2, CLOSED * _spacing(near))
+    rest = (~kept).nonzero()[:, 0]
+    while len(rest) and len(near):
+        reached = KDTree(near).query(points[rest].double(), within=link)[0][:, 0] < math.inf
+        kept[rest[reached]] = True
+        near, rest = points[rest[reached]].double(), rest[~reached]
+    return kept
 
 
 @cached_in_scene

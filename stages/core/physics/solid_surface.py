@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from stages.core.geometry.symmetric_matrices import PAIRS, least_directions
 from stages.core.physics.morphology import surrounded
-from stages.core.physics.particles import filled_voxels, inliers, usable_means
+from stages.core.physics.particles import connected, filled_voxels, usable_means
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
@@ -242,7 +242,7 @@ def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
     """The surface of an object. Raises InputError if none of its Gaussians is usable."""
     voxels, h = filled_voxels(scene, object_id, _voxels_along(scene, object_id), seed)
     means = usable_means(scene, object_id)
-    means = means[inliers(means)] if len(means) else means
+    means = means[connected(means)] if len(means) else means
     return SolidSurface(voxels.numpy(), h, means.double().numpy())
 
 

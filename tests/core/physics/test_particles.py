@@ -12,6 +12,7 @@ from stages.core.errors import InputError
 from stages.core.physics import body_filling, particles
 from stages.core.physics.particles import (
     MIN_PARTICLES,
+    connected,
     filled_voxels,
     inliers,
     sample_bodies,
@@ -259,6 +260,22 @@ def test_outliers_lie_three_and_a_half_robust_deviations_beyond_the_median_dista
     line = torch.cat([torch.zeros(1), distances, -distances])
     kept = inliers(line[:, None] * torch.tensor([0.0, 0.6, 0.8]))
     assert kept.tolist() == (line.abs() < 2.138).tolist()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_long_thin_part_is_connected_and_strays_are_not(seed):
+    """A ball of radius 1 on a stick of length 6, of random points as dense; strays .5 beyond its end.
+
+    Within the radius of the largest hole all but about one of random points have a neighbour.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    angle, height = torch.rand(2, 600, generator=rng)
+    angle, height = 2 * torch.pi * angle, 6 * height
+    stick = torch.stack([0.1 * angle.cos(), 0.1 * angle.sin(), -1 - height], 1)
+    points = torch.cat([sphere(2000, 1.0), stick, torch.tensor([[0.0, 0.0, -7.5]]).expand(3, 3)])
+    kept = connected(points)
+    assert int((~kept[:2600]).sum()) <= 3 and not kept[2600:].any()
+    assert int((~inliers(points)).sum()) > 300
 
 
 @pytest.mark.parametrize(("photographed", "extended"), [(True, True), (False, False)])

@@ -53,6 +53,23 @@ def test_an_egg_is_round_to_one_percent():
     torch.testing.assert_close(shape.inertia.diagonal(), expected, rtol=0.01, atol=0)
 
 
+def test_a_cone_keeps_its_tip():
+    """3/10 m r^2 about its axis, m (3/20 r^2 + 3/80 h^2) across it; the samples' spacing of .02 r cuts off edges."""
+    radius, height = 0.1, 0.2
+    rng = torch.Generator().manual_seed(0)
+    share, turn = torch.rand(12000, generator=rng).sqrt(), 2 * math.pi * torch.rand(12000, generator=rng)
+    base = torch.arange(12000) < 12000 / (1 + math.sqrt(5))  # the area of the base and that of the side
+    ring = radius * share[:, None] * torch.stack([turn.cos(), turn.sin()], 1)
+    points = torch.cat([ring, torch.where(base, 0.0, height * (1 - share))[:, None]], 1)
+    out = torch.where(base[:, None], torch.tensor([0.0, 0, -1]), torch.nn.functional.normalize(points, dim=1))
+    shape = rigid_shapes(scene(Surface(points, out)))[0]
+    assert shape.convex and float(shape.hull[:, 2].max()) > 0.97 * height
+    assert shape.volume == pytest.approx(math.pi * radius**2 * height / 3, rel=0.02)
+    across = 3 / 20 * radius**2 + 3 / 80 * height**2
+    expected = shape.volume * torch.tensor([across, across, 3 / 10 * radius**2])
+    torch.testing.assert_close(shape.inertia.diagonal(), expected, rtol=0.02, atol=0)
+
+
 def test_a_ball_does_not_reach_into_another_object():
     """A ball without 1/10 of its height on a block: a complete ball would penetrate the block."""
     dome = ellipsoid((0.1,) * 3, 3000)

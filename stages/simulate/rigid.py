@@ -5,7 +5,8 @@ of length is the longest side of the smallest object, that of mass the median ma
 
 Contacts have restitution and exact Coulomb friction (`contact_forces.py`); a pair has the larger of its two friction
 coefficients, as in the other engines. Round objects are balls or cylinders with rolling resistance; the sides of two
-cylinders touch along a line (`cylinder_contacts.py`). Non-convex bodies collide with their surfaces
+cylinders touch along a line (`cylinder_contacts.py`), faces of convex bodies over the area that they share
+(`face_contacts.py`). Non-convex bodies collide with their surfaces
 (`surface_contacts.py`). Overlaps at the start are kept (`initial_overlaps.py`), and objects of photos stay at rest
 until disturbed (`resting_bodies.py`). An object with more than half of it below the floor stands on something else,
 such as the ground beside a table: it gets a plane of its own, with which no other body collides.
@@ -39,6 +40,7 @@ from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.contact_forces import find_contact_forces
 from stages.simulate.cylinder_contacts import CylinderContacts
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
+from stages.simulate.face_contacts import FaceContacts
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance, leans
@@ -186,6 +188,7 @@ class _World:
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
         self._cylinders = CylinderContacts(mujoco, self.model)
+        self._faces = FaceContacts(mujoco, self.model)
         self._find_contacts = cache(partial(self._initial_contacts, setup, table, at_rest, options))
         self._has_moved = False
         if options.live:  # now, so that the user's first drag does not wait for it
@@ -198,6 +201,7 @@ class _World:
         """Find the initial overlaps, contacts and supports; deferred until something moves, which needs them."""
         lift = setup.lift.double().numpy()[self._free] * self.scene.metres_per_unit / self.units.length
         self._find_positions()
+        self._faces.replace(self.data)
         self._overlaps = InitialOverlaps(self.model, self.data)
         convex = all(b.shape.convex for b in self.bodies)
         self._surfaces = None if convex else self._surface_contacts(setup, options)
@@ -338,9 +342,11 @@ class _World:
         """Compute the accelerations like mj_forward, with our own contacts and contact forces."""
         mujoco, model, data = self._mujoco, self.model, self.data
         self._find_positions()
-        found = data.ncon
         if self._surfaces is not None:
             self._surfaces.exclude(data)
+        self._faces.replace(data)
+        found = data.ncon
+        if self._surfaces is not None:
             self._surfaces.add(data, self._resting.fixed)
         if self._edges is not None:
             self._edges.apply(data, self._resting.fixed)

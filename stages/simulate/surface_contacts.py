@@ -178,7 +178,7 @@ class SurfaceContacts:
         self._overlaps.note(pair, depth, ~(fixed[:, None] & fixed))
         excess = depth - self._overlaps.depth[pair]
         k = np.flatnonzero(excess > 0)
-        k = k[_extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
+        k = k[extremes(x[k], normal[k], excess[k], a[k] * len(self._path) + b[k])]
         at = x[k] + depth[k, None] / 2 * normal[k]
         geoms = np.stack([self._geom[b[k]], self._geom[a[k]]], 1)
         add_contacts(self._mujoco, self._model, data, AddedContacts(at, normal[k], excess[k], geoms))
@@ -195,7 +195,7 @@ class SurfaceContacts:
         of, plane, excess = of[k], plane[k], excess[k]
         x = turned(data.xmat[1 + of].reshape(-1, 3, 3), self._corners[row[k]]) + data.xpos[1 + of]
         normal = data.geom_xmat[self._planes[plane]][:, 2::3]
-        k = _extremes(x, normal, excess, of * len(self._planes) + plane)
+        k = extremes(x, normal, excess, of * len(self._planes) + plane)
         geoms = np.stack([self._planes[plane[k]], self._geom[of[k]]], 1)
         add_contacts(self._mujoco, self._model, data, AddedContacts(x[k], normal[k], excess[k], geoms))
 
@@ -363,7 +363,7 @@ def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return order, first, middle, reach
 
 
-def _extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.ndarray) -> np.ndarray:
+def extremes(x: np.ndarray, normal: np.ndarray, depth: np.ndarray, pair: np.ndarray) -> np.ndarray:
     """Contact reduction: rows of the contacts that are extreme in eight tangential directions, and of the deepest ones.
 
     Chosen separately for each pair and for each of six axis directions nearest to the normal. Source: Moravanszky and

@@ -63,7 +63,8 @@ class PlausibilityMonitor:
         self._put_into: dict[tuple[int, int], float] = {}  # pair of rows -> depth in the first frame
         self._spread = np.zeros(count)
         self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # last quarter of the run
-        self._energy: list[tuple[float, float]] = []  # kinetic and potential energy
+        self._energy: list[tuple[float, float]] = []  # kinetic and potential energy between frames
+        self._start: tuple[float, float] | None = None  # kinetic and potential energy at the start
         self._second_moment = cache(self._second_moment_of)
         self._before: tuple[list[np.ndarray], np.ndarray, np.ndarray] | None = None
 
@@ -82,7 +83,9 @@ class PlausibilityMonitor:
                 self._spread[i] = max(self._spread[i], abs(_radius(p) / radius - 1))
         self._measure_penetration(points, com, R)
         mass = np.ones(len(com)) if state.mass is None else state.mass.double().numpy()
-        if self._before is not None:
+        if self._before is None:
+            self._start = self._start_energy(com, mass)
+        else:
             self._energy.append(self._mechanical_energy((points, com, R), self._before, mass))
         self._before = points, com, R
 
@@ -157,6 +160,12 @@ class PlausibilityMonitor:
         body = self._surface(row)
         return np.cov(body.voxels.T, bias=True) + body.h**2 / 12 * np.eye(3)
 
+    def _start_energy(self, com: np.ndarray, mass: np.ndarray) -> tuple[float, float]:
+        """Like `_mechanical_energy`, from the velocities of the prompts: there may be an impact within the first frame."""
+        moving = {id: v for id, v in self._prompts.velocity.items() if id not in self._prompts.pinned}
+        kinetic = np.array([math.hypot(*moving.get(o.id, (0.0,))) ** 2 / 2 for o in self._scene.objects])
+        return float(mass @ kinetic / mass.sum()), float(mass @ (self._g * com[:, 2]) / mass.sum())
+
     def _mechanical_energy(self, now: tuple, before: tuple, mass: np.ndarray) -> tuple[float, float]:
         """Kinetic and potential energy per unit mass between two frames [units^2 / s^2].
 
@@ -190,7 +199,8 @@ class PlausibilityMonitor:
     def _energy_gain(self) -> float:
         ends = [f.end for f in self._prompts.forces] + [c.start for c in self._prompts.changes]
         first = 0 if not ends else min(max(ends) / self._options.dt, math.inf)
-        both = np.array(self._energy[math.ceil(first) :] if math.isfinite(first) else [])
+        known = self._energy if self._start is None or ends else [self._start, *self._energy]
+        both = np.array(known[math.ceil(first) :] if math.isfinite(first) else [])
         if len(both) < 2:
             return 0.0
         energy, kinetic = both.sum(1), both[:, 0]

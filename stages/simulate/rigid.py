@@ -6,10 +6,10 @@ of length is the longest side of the smallest object, that of mass the median ma
 Contacts have restitution and exact Coulomb friction (`contact_forces.py`); a pair has the larger of its two friction
 coefficients, as in the other engines. Round objects are balls or cylinders with rolling resistance; the sides of two
 cylinders touch along a line (`cylinder_contacts.py`), faces of convex bodies over the area that they share
-(`face_contacts.py`). Non-convex bodies collide with their surfaces
-(`surface_contacts.py`). Overlaps at the start are kept (`initial_overlaps.py`), and objects of photos stay at rest
-until disturbed (`resting_bodies.py`). An object with more than half of it below the floor stands on something else,
-such as the ground beside a table: it gets a plane of its own, with which no other body collides.
+(`face_contacts.py`). Non-convex bodies collide with their surfaces (`surface_contacts.py`). Overlaps at the start are
+kept (`initial_overlaps.py`), and objects of photos stay at rest until disturbed (`resting_bodies.py`). An object with
+more than half of it below the floor stands on something else, such as the ground beside a table: it gets a plane of its
+own, with which no other body collides.
 """
 
 from __future__ import annotations

@@ -31,12 +31,14 @@ def scene() -> Scene:
     return Scene(concatenate(parts), (SceneObject(1, "lower"), SceneObject(2, "upper")), None, 0.0)
 
 
-def measured(scene: Scene, path, stretch=lambda t: 1.0, frames: int = 40) -> tuple[dict, PlausibilityMonitor]:
+def measured(
+    scene: Scene, path, stretch=lambda t: 1.0, frames: int = 40, prompts: ForcePrompts | None = None
+) -> tuple[dict, PlausibilityMonitor]:
     """Measures of a motion in which the upper cube is displaced by `path(t)` [m] and stretched about its centre."""
     keypoints = choose_keypoints(scene, 256)
     upper = keypoints.object_id == 2
     com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])
-    monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), SimulateOptions())
+    monitor = PlausibilityMonitor(scene, keypoints, prompts or ForcePrompts(), SimulateOptions())
     for n in range(frames):
         shift = torch.tensor(path(n * DT))
         x, moved = keypoints.rest.clone(), com.clone()
@@ -187,6 +189,13 @@ def test_gain_of_energy_relative_to_what_was_converted(scene, energy, gain):
     monitor = monitor_of(scene)
     monitor._energy = [(0.0, e) for e in energy]
     assert monitor._energy_gain() == pytest.approx(gain, rel=0.02)
+
+
+def test_a_rebound_before_the_second_frame_gains_no_energy(scene):
+    """From a wall, .6 of the way through the first frame: the mean speed of that frame is below the one after it."""
+    thrown = ForcePrompts(velocity={2: (5.0, 0.0, 0.0)})
+    found, _ = measured(scene, lambda t: (min(5 * t, 0.06 - 4 * (t - 0.012)), 0.0, 0.1), prompts=thrown)
+    assert found["energy_gain"] < 1e-6
 
 
 def test_gain_of_energy_where_none_is_lost_is_relative_to_the_kinetic_energy(scene):

@@ -183,6 +183,19 @@ def test_nothing_passes_through_a_wall_in_a_step(device, name):
         assert float(com[:, 0].min()) > -0.21
 
 
+@pytest.mark.parametrize(("friction", "share"), [(0.0, 1.0), (0.5, 1 / 1.8)])
+def test_a_ball_touches_both_sides_of_a_groove(device, friction, share):
+    """In an L on its edge; the ball rolls at 1 / (1 + 2/5 r^2 / d^2) of its speed, with d = r / sqrt(2)."""
+    radius, at = 0.05, (-0.21 + 0.05, -0.15, 0.04 + 0.05)
+    bodies = [tilted(body, -45).moved((0, 0, 0.5)) for body in (WALL, ellipsoid((radius,) * 3, 1500).moved(at))]
+    scene = Run(tuple(Specimen(b, loss=0.02) for b in bodies)).scene()
+    t = roll_out(scene, SimulateOptions(engine="ngff", contact="solved", steps=31, pin=("1",), friction=friction,
+                                        velocity=("object=2 0,.4,0",), keypoints=64, device=device))  # fmt: skip
+    path = t.com[:, 1] - t.com[0, 1]
+    assert float(path[-1, 1] - path[-11, 1]) / 0.2 == pytest.approx(0.4 * share, rel=0.02)
+    assert float(path[:, [0, 2]].norm(dim=1).max()) < 0.02 * radius
+
+
 def test_an_edge_slides_along_a_face_without_a_jolt(device):
     """A ladder between a wall and a floor without friction rotates from 60 to 40 degrees."""
     length, thick, start = 1.0, 0.1, math.radians(60)

@@ -19,7 +19,7 @@ from stages.core.models.field.body_surfaces import BodyGrid, BodySurfaces
 @wp.kernel(enable_backward=False)
 def _closest(s: SurfaceArrays, x: wp.array[wp.vec3], at: wp.array[wp.vec3], normal: wp.array[wp.vec3]):
     i = wp.tid()
-    found = closest_point(s, 0, x[i])
+    found = closest_point(s, 0, x[i], wp.vec3(), wp.vec3())
     at[i] = found.at
     normal[i] = found.normal
 

@@ -33,7 +33,8 @@ SLOTS = wp.constant(6 * 9)  # contact slots of a pair
 NONE = wp.constant(-1)
 DIAGONAL = wp.constant(0.70710678)  # 1 / sqrt(2)
 GAP_WEIGHT = wp.constant(10.0)  # factor by which a sample's gap reduces its extent along a direction
-AHEAD = wp.constant(9)  # slot of the point where a ball hits another body during a step; its nearest point has slot 0
+AHEAD = wp.constant(9)  # slot of the point where a ball hits another body during a step
+RANKS = wp.constant(3)  # nearest points of a ball on different sides of another body, in the first slots
 
 
 @wp.struct
@@ -160,10 +161,7 @@ def _keep_extremes(w: CollisionWorld, scene: int, pair: int, k: int):
 
 @wp.func
 def _count_contacts(w: CollisionWorld, scene: int, pair: int):
-    """Clear slots whose sample is in an earlier slot of the same side, and count the rest.
-
-    A ball fills its slots here: with another body it has up to two contacts, with each plane one.
-    """
+    """Clear slots whose sample is in an earlier slot of the same side, and count the rest; a ball has few slots."""
     a = pair // w.surfaces.near.shape[0]
     b = pair % w.surfaces.near.shape[0]
     count = int(0)
@@ -174,11 +172,11 @@ def _count_contacts(w: CollisionWorld, scene: int, pair: int):
             if a == b and slot % EXTREMES == 0:
                 gap = plane_near(w.surfaces, w.motion, scene, a, slot // EXTREMES, 0).gap
                 touches = gap < w.motion.margin[scene, a]
-            elif slot == 0:
-                touches = ball_near(w.surfaces, w.motion, scene, a, b).gap < _margin(w.motion, scene, a, b)
+            elif a != b and slot < RANKS:
+                touches = ball_near(w.surfaces, w.motion, scene, a, b, slot).gap < _margin(w.motion, scene, a, b)
             elif slot == AHEAD and a != b:
                 touches = ball_ahead(w.surfaces, w.motion, scene, a, b).gap < _margin(w.motion, scene, a, b)
-            w.found.row[scene, at] = wp.where(touches, 0, NONE)
+            w.found.row[scene, at] = wp.where(touches, slot % EXTREMES, NONE)
         for other in range(slot - slot % EXTREMES, slot):
             if w.found.row[scene, pair * SLOTS + other] == w.found.row[scene, at]:
                 w.found.row[scene, at] = NONE
@@ -229,5 +227,5 @@ def contact_in_slot(w: CollisionWorld, scene: int, pair: int, slot: int) -> Near
     if w.surfaces.radius[a] > 0.0:
         if slot == AHEAD:
             return ball_ahead(w.surfaces, w.motion, scene, a, b)
-        return ball_near(w.surfaces, w.motion, scene, a, b)
+        return ball_near(w.surfaces, w.motion, scene, a, b, slot)
     return sample_near(w.surfaces, w.motion, scene, a, b, q)

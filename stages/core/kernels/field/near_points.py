@@ -12,7 +12,14 @@ from __future__ import annotations
 import warp as wp
 
 from stages.core.geometry import surface_faces as faces
-from stages.core.kernels.field.surface_lookup import SurfaceArrays, closest_point, depth_at, first_inside, nearest_node
+from stages.core.kernels.field.surface_lookup import (
+    APART,
+    SurfaceArrays,
+    closest_point,
+    depth_at,
+    first_inside,
+    nearest_node,
+)
 
 NO_CONTACT = wp.constant(1.0e18)  # gap that stands for "no contact" [m]
 MARGIN = wp.constant(0.05)  # gap up to which contacts are detected, plus the travel in a step [m]; a tenth of an object
@@ -280,25 +287,43 @@ def sample_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int
 
 
 @wp.func
-def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int) -> NearPoint:
-    """Contact at the point of a ball a that is closest to body b."""
+def ball_near(s: SurfaceArrays, motion: BodyMotion, scene: int, a: int, b: int, rank: int) -> NearPoint:
+    """Contact at the point of a ball a that is closest to body b (rank 0), or to another side of it (ranks 1 and 2).
+
+    Only non-convex bodies have other sides, such as those of a groove or a corner; without one the gap is NO_CONTACT.
+    """
     out = NearPoint()
     out.a = a
     out.b = b
+    out.facing = True
     centre = motion.com[scene, a] + motion.R[scene, a] * s.centre[a]
     apart = centre - (motion.com[scene, b] + motion.R[scene, b] * s.centre[b])
     out.normal = wp.normalize(apart)
     out.gap = wp.length(apart) - s.radius[a] - s.radius[b]
-    if s.radius[b] == 0.0:
-        on = closest_point(s, b, in_body_frame(motion, scene, b, centre))
-        outward = centre - (motion.com[scene, b] + motion.R[scene, b] * on.at)
-        normal = motion.R[scene, b] * on.normal
-        side = wp.where(wp.dot(outward, normal) < 0.0, -1.0, 1.0)  # the centre of the ball may be inside b
-        out.gap = side * wp.length(outward) - s.radius[a]
-        out.normal = wp.where(wp.length(outward) > NO_DISTANCE * s.radius[a], side * wp.normalize(outward), normal)
+    if rank > 0 and (s.radius[b] > 0.0 or s.hull_faces[b] > 0):
+        out.gap = NO_CONTACT
+    elif s.radius[b] == 0.0:
+        x = in_body_frame(motion, scene, b, centre)
+        one = wp.vec3()
+        two = wp.vec3()
+        i = int(0)
+        while i <= rank:  # Warp would unroll a range
+            on = closest_point(s, b, x, one, two)
+            way = on.at - x
+            distance = wp.length(way)
+            outside = wp.dot(way, on.normal) <= 0.0  # the centre of the ball may be inside b
+            if i < rank:
+                two = one
+                one = -way / wp.max(distance, NO_DISTANCE * s.radius[a])
+            i += 1
+        side = wp.where(outside, 1.0, -1.0)
+        out.gap = side * distance - s.radius[a]
+        normal = wp.where(distance > NO_DISTANCE * s.radius[a], -side * wp.normalize(way), on.normal)
+        out.normal = motion.R[scene, b] * normal
+        if rank > 0 and (not outside or wp.min(wp.dot(way, one), wp.dot(way, two)) < -APART * distance):
+            out.gap = NO_CONTACT
     out.at = centre - s.radius[a] * out.normal
     out.gap += s.overlap[a, b]
-    out.facing = True
     return out
 
 

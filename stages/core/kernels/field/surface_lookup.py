@@ -11,6 +11,7 @@ STEP = wp.constant(2.0)  # longest of these steps [grid spacings]
 SWEEP_STEPS = wp.constant(64)  # maximum number of steps along a path; each is at least one grid spacing long
 MIN_INWARD = wp.constant(0.3)  # smallest cosine between a path and the inward direction for the path to hit a surface
 HULL_STEPS = wp.constant(32)  # maximum iterations to the closest point of a hull; each adds a face, about three suffice
+APART = wp.constant(0.9)  # largest cosine between normals of different sides of a body
 ON_FACE = wp.constant(wp.float64(1e-6))  # distance from a face up to which a point is on it [reach of the body]
 
 
@@ -247,13 +248,16 @@ def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePo
 
     Each step moves along the tangent plane towards x and back onto the surface. If that does not reduce the distance,
     because the surface bends away from the plane, the step length is halved.
+
+    Samples with normals near `one` or `two` do not count.
     """
     nearest = int(0)
     least = float(1.0e18)
     for q in range(s.samples.shape[1]):
         if s.near[body, q] >= 0:
             distance = wp.length_sq(x - s.samples[body, q])
-            if distance < least:
+            normal = s.normals[body, q]
+            if distance < least and wp.max(wp.dot(normal, one), wp.dot(normal, two)) <= APART:
                 least = distance
                 nearest = q
     out = _onto_surface(s, body, s.samples[body, nearest])
@@ -272,8 +276,11 @@ def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePo
 
 
 @wp.func
-def closest_point(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
-    """Closest point to x, in the frame of a body, on the surface of the body, which must not be a ball."""
+def closest_point(s: SurfaceArrays, body: int, x: wp.vec3, one: wp.vec3, two: wp.vec3) -> SurfacePoint:
+    """Closest point to x, in the frame of a body, on the surface of the body, which must not be a ball.
+
+    On a non-convex body only sides count whose normals differ from `one` and `two`, unless these are zero.
+    """
     if s.hull_faces[body] > 0:
         return _closest_point_of_hull(s, body, x)
-    return _closest_point_of_grid(s, body, x)
+    return _closest_point_of_grid(s, body, x, one, two)

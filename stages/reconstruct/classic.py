@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import depths, resize
 from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
+from stages.core.scene.lens import ASPECT_TOLERANCE
 from stages.reconstruct import depth, sfm, world_frame
 from stages.reconstruct.build_scene import SceneGeometry, build_scene
 from stages.reconstruct.matching import MatchingOptions
@@ -58,21 +60,32 @@ def _cameras(
     both = [i for i, name in enumerate(photos.names) if name in row]
     if len(both) < 2:
         raise InputError(
-            f"{options.cameras}: names {len(both)} of the photos in {photos.source}; its file_path entries must end "
-            f"in the photos' names, such as {photos.names[0]}"
+            f"{options.cameras}: names {len(both)} of the photos in {photos.source}; its paths of images must end in "
+            f"the photos' names, such as {photos.names[0]}"
         )
     if len(both) < len(photos):
         log.info("left out, without a given camera: %s", ", ".join(sorted(set(photos.names) - set(row))))
     photos = photos[both]
     rows = [row[name] for name in photos.names]
-    cameras, lenses = _rescale_to_photos(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
+    cameras = _rescale_to_photos(photos, cameras[rows], options.cameras)
+    lenses = LensDistortion(lenses.coefficients[rows])
     return sfm.triangulate(photos, cameras, lenses, matching, steps), photos
 
 
-def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:
-    """Scale K to pixels of the loaded photos, which may be smaller than the files."""
+def _rescale_to_photos(photos: Photos, cameras: Cameras, source: Path) -> Cameras:
+    """Scale K to pixels of the loaded photos, which may be smaller than the files.
+
+    Raises InputError, which names the file `source` of the cameras, if one has another aspect ratio than its photo.
+    """
     sizes = torch.tensor([photos.size(i) for i in range(len(photos))])
     ratio = sizes / cameras.sizes
+    wrong = ((ratio[:, 0] / ratio[:, 1] - 1).abs() > ASPECT_TOLERANCE).nonzero().flatten().tolist()
+    if wrong:
+        (w, h), (width, height) = cameras.sizes[wrong[0]].tolist(), photos.file_size(wrong[0])
+        raise InputError(
+            f"{source}: says that {cameras.names[wrong[0]]} has {w}x{h} pixels, but upright the photo has "
+            f"{width}x{height}; estimate the cameras from these photos, saved upright"
+        )
     Ks = torch.stack([resize(K, float(sx), float(sy)) for K, (sx, sy) in zip(cameras.Ks, ratio, strict=True)])
     return replace(cameras, Ks=Ks, sizes=sizes)
 

@@ -161,7 +161,7 @@ class PlausibilityMonitor:
         return np.cov(body.voxels.T, bias=True) + body.h**2 / 12 * np.eye(3)
 
     def _start_energy(self, com: np.ndarray, mass: np.ndarray) -> tuple[float, float]:
-        """Like `_mechanical_energy`, from the velocities of the prompts: there may be an impact within the first frame."""
+        """Like `_mechanical_energy`, from the velocities of the prompts: an impact may follow in the first frame."""
         moving = {id: v for id, v in self._prompts.velocity.items() if id not in self._prompts.pinned}
         kinetic = np.array([math.hypot(*moving.get(o.id, (0.0,))) ** 2 / 2 for o in self._scene.objects])
         return float(mass @ kinetic / mass.sum()), float(mass @ (self._g * com[:, 2]) / mass.sum())

@@ -139,6 +139,13 @@ def test_cameras_of_other_photos_are_refused(tmp_path):
     assert not (tmp_path / "s.ply").exists()
 
 
+def test_cameras_of_photos_that_were_not_yet_upright_are_refused(tmp_path):
+    cameras = write_set(tmp_path, arc(3, (64, 48)))
+    cameras.write_text(json.dumps(json.loads(cameras.read_text()) | {"w": 48, "h": 64}))
+    with pytest.raises(InputError, match=r"photo_00.png has 48x64 pixels, but upright the photo has 64x48"):
+        run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras))
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +21,7 @@ from stages.core.scene.schema import LARGEST, number, numbers, quote, read_json,
 LENS_MODEL = "opencv"  # the only lens model: k1 k2 p1 p2 k3 of OpenCV
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MAX_SIDE = 65536  # largest side of an image [px]
+MIN_EXTENT = 1e-4  # smallest extent of camera positions, relative to their distance from the origin (float32: 7 digits)
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # in transforms.json
 
 
@@ -160,8 +163,8 @@ class LensDistortion:
 def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
     """Read the cameras of a nerfstudio transforms.json or a COLMAP model folder (cameras and images), sorted by name.
 
-    K and size are those of the photos as taken. Raises InputError for other files, and for camera models with
-    distortion parameters beyond OpenCV's first five, such as fisheye lenses.
+    K and size are those of the photos as taken. Raises InputError for other files, for two photos of one name, and for
+    camera models with distortion parameters beyond OpenCV's first five, such as fisheye lenses.
     """
     path = Path(path)
     if path.is_dir():
@@ -183,22 +186,38 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
     viewmats, Ks, sizes, names, lenses = [], [], [], [], []
     for frame in sorted(data["frames"], key=lambda frame: frame["file_path"]):
         value = {**data, **frame}
-        c2w = np.array([numbers(row, 4, "transform_matrix") for row in frame["transform_matrix"]])
+        rows = [*frame["transform_matrix"], [0, 0, 0, 1]][:4]  # some tools omit the last row
+        c2w = np.array([numbers(row, 4, "transform_matrix") for row in rows])
         viewmats.append(np.linalg.inv(c2w @ np.diag([1.0, -1, -1, 1])))
-        fx, fy, cx, cy = (number(value[name], name) for name in ("fl_x", "fl_y", "cx", "cy"))
-        Ks.append([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         sizes.append([number(value[name], name, 1, MAX_SIDE) for name in ("w", "h")])
+        Ks.append(_transforms_K(value, *sizes[-1]))
         names.append(quote(Path(frame["file_path"]).name, 255))
         lenses.append(_transforms_lens(value))
     if not names:
         raise ValueError("no frames")
-    cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes).long(), tuple(names))
-    return check_cameras(cameras), LensDistortion(_float(lenses))
+    return _known_cameras(viewmats, Ks, sizes, names), LensDistortion(_float(lenses))
+
+
+def _transforms_K(value: dict, width: float, height: float) -> list[list[float]]:
+    """K of a frame; angles of view, square pixels and the centre of the image replace what is absent."""
+    fx, fy = (_focal(value, axis, side) for axis, side in (("x", width), ("y", height)))
+    if fx is None and fy is None:
+        raise KeyError("fl_x")
+    cx, cy = number(value.get("cx", width / 2), "cx"), number(value.get("cy", height / 2), "cy")
+    return [[fx if fx is not None else fy, 0.0, cx], [0.0, fy if fy is not None else fx, cy], [0.0, 0.0, 1.0]]
+
+
+def _focal(value: dict, axis: str, side: float) -> float | None:
+    """The focal length along an axis [px], from the angle of view where it is absent; None without either."""
+    if f"fl_{axis}" in value:
+        return number(value[f"fl_{axis}"], f"fl_{axis}")
+    angle = f"camera_angle_{axis}"
+    return side / 2 / math.tan(number(value[angle], angle, 1e-3, 3.1) / 2) if angle in value else None
 
 
 def _transforms_lens(value: dict) -> list[float]:
     """k1 k2 p1 p2 k3 of a frame. Raises ValueError for another lens model."""
-    model = value.get("camera_model", "OPENCV")
+    model = "OPENCV_FISHEYE" if value.get("is_fisheye") else value.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS or any(value.get(k, 0) for k in ("k4", "k5", "k6")):
         raise ValueError(f"camera_model {model} with k4 {value.get('k4', 0)}: only k1 k2 p1 p2 k3 are supported")
     return [number(value.get(k, 0.0), k) for k in DISTORTION]
@@ -213,14 +232,30 @@ def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
             raise ValueError("camera model FULL_OPENCV with k4 to k6 is not supported; undistort it with `colmap "
                              "image_undistorter`")  # fmt: skip
         sizes = [numbers(image.size, 2, f"the size of {image.name}", 1, MAX_SIDE) for image in images]
-        cameras = Cameras(_float([image.viewmat for image in images]), _float([image.K for image in images]),
-                          torch.tensor(sizes).long(), tuple(image.name for image in images))  # fmt: skip
-        return check_cameras(cameras), LensDistortion(_float([image.lens[:5] for image in images]))
+        viewmats, Ks, names = zip(*((image.viewmat, image.K, image.name) for image in images), strict=True)
+        return _known_cameras(viewmats, Ks, sizes, names), LensDistortion(_float([i.lens[:5] for i in images]))
     except OSError as error:
-        raise InputError(f"{path}: holds no COLMAP model (cameras and images, .bin or .txt)") from error
+        inside = min((p.parent for depth in ("*/", "*/*/") for p in path.glob(f"{depth}cameras.*")), default=None)
+        hint = f"; give {inside}" if inside else ""
+        raise InputError(f"{path}: holds no COLMAP model (cameras and images, .bin or .txt){hint}") from error
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the COLMAP model cannot be used: {reason(error)}") from error
 
 
-def _float(rows: list) -> Tensor:
+def _known_cameras(viewmats: Sequence, Ks: Sequence, sizes: Sequence, names: Sequence[str]) -> Cameras:
+    """The cameras, checked; ValueError for two of one name, and for positions beyond single precision."""
+    if twice := next((name for name, count in Counter(names).items() if count > 1), None):
+        raise ValueError(f"two photos are named {twice}, without their folders; rename them")
+    cameras = check_cameras(Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes).long(), tuple(names)))
+    eyes = np.linalg.inv(np.array(viewmats, dtype=np.float64))[:, :3, 3]
+    extent, far = np.ptp(eyes, axis=0).max(), np.abs(eyes).max()
+    if 0 < extent < MIN_EXTENT * far:
+        raise ValueError(
+            f"the cameras are {far:.3g} from the origin, but only {extent:.3g} from each other; subtract an offset "
+            "from their positions"
+        )
+    return cameras
+
+
+def _float(rows: Sequence) -> Tensor:
     return torch.from_numpy(np.array(rows, dtype=np.float64)).float()

@@ -113,8 +113,10 @@ def _cameras_txt(path: Path) -> dict[int, tuple]:
 
 
 def _images_txt(path: Path) -> list[tuple[str, tuple, int]]:
-    rows = []
-    for line in _lines(path)[::2]:  # every second line lists the features, and may be empty
+    rows, lines = [], _lines(path)
+    if wrong := next((line for line in lines[1::2] if len(line.split()) % 3), None):
+        raise ValueError(f"{path.name} has the line {quote(wrong)} in place of an image's features, or an empty line")
+    for line in lines[::2]:  # every second line has the features, x y and a point, and may be empty
         words = line.split(maxsplit=9)
         if len(words) != 10:
             raise ValueError(f"{path.name} has the line {quote(line)}")

@@ -30,8 +30,8 @@ def quote(value: object, limit: int = MAX_QUOTED) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The text of an exception for error messages; for a KeyError, with its type."""
-    return quote(repr(error) if isinstance(error, KeyError) else error, 120)
+    """The text of an exception for error messages; a KeyError says what is absent."""
+    return quote(f"{error} is absent" if isinstance(error, KeyError) else error, 120)
 
 
 def number(value: object, what: str, low: Bound = -LARGEST, high: Bound = LARGEST) -> float:

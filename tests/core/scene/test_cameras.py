@@ -177,10 +177,58 @@ def test_other_lenses_of_colmap_are_refused(tmp_path, model, params):
         read_cameras(write_colmap(tmp_path, model, params))
 
 
-@pytest.mark.parametrize("more", [{"camera_model": "OPENCV_FISHEYE"}, {"k4": 0.1}, {"k1": float("nan")}])
+@pytest.mark.parametrize(
+    "more", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}, {"k4": 0.1}, {"k1": float("nan")}]
+)
 def test_other_lenses_of_transforms_are_refused(tmp_path, more):
     with pytest.raises(InputError, match="only k1 k2 p1 p2 k3|not finite"):
         read_cameras(write_transforms(tmp_path, **more))
+
+
+@pytest.mark.parametrize(
+    ("absent", "angle", "K"),
+    [(["fl_y"], {}, [[50, 0, 32], [0, 50, 24], [0, 0, 1]]),
+     (["fl_x", "fl_y", "cx", "cy"], {"camera_angle_x": np.pi / 2}, [[32, 0, 32], [0, 32, 24], [0, 0, 1]]),
+     (["fl_y"], {"camera_angle_y": np.pi / 2}, [[50, 0, 32], [0, 24, 24], [0, 0, 1]])],
+)  # fmt: skip
+def test_absent_intrinsics_of_transforms_follow_from_the_others(tmp_path, absent, angle, K):
+    path = write_transforms(tmp_path, **angle)
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k not in absent}))
+    torch.testing.assert_close(read_cameras(path)[0].Ks[0], torch.tensor(K, dtype=torch.float32))
+
+
+@pytest.mark.parametrize("absent", ["w", "fl_x"])
+def test_transforms_without_size_or_focal_length_are_refused(tmp_path, absent):
+    path = write_transforms(tmp_path)
+    absent = ["fl_x", "fl_y"] if absent == "fl_x" else [absent]
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k not in absent}))
+    with pytest.raises(InputError, match=f"'{absent[0]}' is absent"):
+        read_cameras(path)
+
+
+def test_poses_of_three_rows_are_read(tmp_path):
+    path = write_transforms(tmp_path)
+    whole, _ = read_cameras(path)
+    path.write_text(path.read_text().replace(json.dumps(POSE), json.dumps(POSE[:3])))
+    assert torch.equal(read_cameras(path)[0].viewmats, whole.viewmats)
+
+
+def test_two_photos_of_one_name_are_refused(tmp_path):
+    path = write_transforms(tmp_path)
+    path.write_text(path.read_text().replace("images/b.jpg", "other/a.jpg"))
+    with pytest.raises(InputError, match="two photos are named a.jpg, without their folders; rename"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(("offset", "right"), [(1000.0, True), (4e6, False)])
+def test_cameras_far_from_the_origin_are_refused(tmp_path, offset, right):
+    path = write_transforms(tmp_path)
+    data = json.loads(path.read_text())
+    for i, frame in enumerate(data["frames"]):
+        frame["transform_matrix"] = [[1, 0, 0, offset + i], *POSE[1:]]
+    path.write_text(json.dumps(data))
+    with nullcontext() if right else pytest.raises(InputError, match="4e.06 from the origin, but only 1 from each"):
+        read_cameras(path)
 
 
 def test_real_reference_cameras_are_read(shared):
@@ -199,5 +247,13 @@ def test_other_json_is_refused(tmp_path, text, reason):
 def test_a_folder_without_a_colmap_model_and_an_absent_file_are_refused(tmp_path):
     with pytest.raises(InputError, match="none.json: no such file; give a transforms.json or a COLMAP model folder"):
         read_cameras(tmp_path / "none.json")
-    with pytest.raises(InputError, match="no COLMAP model"):
+    with pytest.raises(InputError, match="no COLMAP model.*txt[)]$"):
         read_cameras(tmp_path)
+
+
+def test_a_colmap_project_names_the_folder_of_its_model(tmp_path):
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    (tmp_path / "sparse/0/cameras.bin").touch()
+    for folder in (tmp_path, tmp_path / "sparse"):
+        with pytest.raises(InputError, match="no COLMAP model.*; give .*/sparse/0$"):
+            read_cameras(folder)

@@ -93,6 +93,7 @@ def test_damaged_binary_models_are_refused(tmp_path, what):
     ("1 PINHOLE 64 48 50 51 32 24 1\n", IMAGES, "cameras.txt has the line 1 PINHOLE"),
     (CAMERAS, "1 1 0 0 0 0 0 0 7\n\n", "images.txt has the line 1 1 0"),
     (CAMERAS, "1 1 0 0 0 0 0 x 7 a.jpg\n\n", "could not convert"),
+    (CAMERAS, IMAGES.replace("1 2 -1\n", ""), "images.txt has the line 2 2 0 .* a.jpg in place of"),
 ])  # fmt: skip
 def test_damaged_text_models_are_refused(tmp_path, cameras, images, message):
     with pytest.raises(ValueError, match=message):

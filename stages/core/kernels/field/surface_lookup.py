@@ -243,13 +243,12 @@ def _onto_surface(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
 
 
 @wp.func
-def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3) -> SurfacePoint:
+def _closest_point_of_grid(s: SurfaceArrays, body: int, x: wp.vec3, one: wp.vec3, two: wp.vec3) -> SurfacePoint:
     """Closest point of a surface on a grid, by projected descent from the nearest sample.
 
     Each step moves along the tangent plane towards x and back onto the surface. If that does not reduce the distance,
-    because the surface bends away from the plane, the step length is halved.
-
-    Samples with normals near `one` or `two` do not count.
+    because the surface bends away from the plane, the step length is halved. Samples with normals
+    near `one` or `two` do not count.
     """
     nearest = int(0)
     least = float(1.0e18)

@@ -17,6 +17,7 @@ from stages.core.errors import InputError
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from stages.core.scene.images import image_data, import_av, list_photos, open_video, read_8_bit, reduce_frame
 from stages.core.scene.recordings import limit_size
+from stages.core.scene.schema import quote
 from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.photos import Photos
 
@@ -113,6 +114,8 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
     """Each readable photo with its index; the errors of the others are added to `unread`, by file name."""
     for i, file in enumerate(tqdm(files, desc="reading photos", unit="photo", leave=False)):
         try:
+            if file.name.encode(errors="replace").decode() != file.name:
+                raise InputError(f"{file.parent / quote(file.name)}: has a name that is not UTF-8; rename it")
             if _is_truncated(image_data(file, "a photo")):
                 raise InputError(f"{file}: is truncated; copy it again from its source")
             image = read_8_bit(file)

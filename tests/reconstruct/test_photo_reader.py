@@ -1,6 +1,8 @@
 """Typical folders of users' photos, and videos of phones."""
 
 import logging
+import os
+import shutil
 import struct
 import zlib
 from fractions import Fraction
@@ -129,9 +131,11 @@ def test_other_files_with_photo_suffixes_are_left_out(folder, caplog):
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
     (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC with the suffix of JPEG
     (folder / "huge.png").write_bytes(png_with_declared_size(60_000, 60_000))
+    shutil.copy(folder / "a.jpg", folder / os.fsdecode(b"caf\xe9.jpg"))  # Latin-1
     photos = read_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg")
-    for message in ("folder.jpg: is a folder", "link.jpg: no such file", "phone.jpg: is not an", "huge.png: is d"):
+    for message in ("folder.jpg: is a folder", "link.jpg: no such file", "phone.jpg: is not an", "huge.png: is d",
+                    "has a name that is not UTF-8; rename it"):  # fmt: skip
         assert message in caplog.text
 
 

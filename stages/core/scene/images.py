@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our own errors say the same in one line
 IGNORE_LABEL = 255  # value of pixels in label images that are not evaluated
 MAX_IMAGE_BYTES = 1 << 30  # largest image file [bytes]
+MAX_FLOAT = 16.0  # largest value of float images, whose white is 1 (highlights have more); above it white is 255
 MAX_VIDEO_PIXELS = 1 << 26  # maximum number of pixels of a video frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, because the encoded file depends on the number of threads
 MAX_PENDING_FRAMES = 8  # maximum number of video frames that wait for the encoder
@@ -62,8 +63,8 @@ def _read_rgb(path: Path) -> np.ndarray:
 def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
     image = pixels.astype(np.float32)
     image /= np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
-    if pixels.dtype.kind == "f" and not np.isfinite(image).all():
-        raise InputError(f"{path}: has values that are not finite; convert it to JPEG or PNG")
+    if pixels.dtype.kind == "f" and not (np.isfinite(image).all() and image.max() <= MAX_FLOAT):
+        raise InputError(f"{path}: has values that are not finite, or not from 0 to 1; convert it to JPEG or PNG")
     return torch.from_numpy(image)
 
 

@@ -4,6 +4,7 @@ import struct
 import sys
 import wave
 import zlib
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -299,10 +300,14 @@ def test_a_film_that_breaks_off_is_refused_or_used_up_to_there(tmp_path, caplog)
             list(read_video(tmp_path / name))
 
 
+@pytest.mark.parametrize(("value", "right"), [(1.5, True), (255.0, False), (float("nan"), False)])
+def test_float_images_are_white_at_one(tmp_path, value, right):
+    cv2.imwrite(str(tmp_path / "a.tiff"), np.full((3, 4, 3), value, np.float32))
+    with nullcontext() if right else pytest.raises(InputError, match="a.tiff: has values .* not from 0 to 1; convert"):
+        assert float(read_image(tmp_path / "a.tiff").max()) == value
+
+
 def test_damaged_pixels_are_refused(tmp_path, monkeypatch):
-    cv2.imwrite(str(tmp_path / "a.tiff"), np.full((3, 4, 3), np.nan, np.float32))
-    with pytest.raises(InputError, match="a.tiff: has values that are not finite; convert it"):
-        read_image(tmp_path / "a.tiff")
     write_png(tmp_path / "b.png", torch.zeros(4, 4, 3))
 
     def failing(*_):

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.schema import parse_json, reason
 from stages.lab.assets.field_sampling import diffuse_light, normalise_size
 from stages.lab.assets.mesh_files import MESH_SUFFIXES
 from stages.lab.assets.shapes import Surface, single_threaded, to_gaussians
 from stages.lab.assets.winding import winding_signs
 
+log = logging.getLogger(__name__)
 UP_ROTATIONS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
            "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}  # fmt: skip
+COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
+MAX_VERTICES = 10**7  # largest count of a glTF accessor without data, which is read as zeros
 MIN_AREA = 1e-9  # smallest total area of all faces [longest sides^2]; smaller values are rounding errors
 
 
@@ -59,6 +64,8 @@ def _load(path: Path) -> list:
         import trimesh  # an optional extra
     except ImportError as error:
         raise MissingPackage(f"{path}: reading meshes needs trimesh: `pip install 'ngff[mesh]'`") from error
+    if path.suffix.lower() in (".glb", ".gltf"):
+        _check_gltf(path)
     try:
         scene = trimesh.load_scene(path, process=False)  # processing would merge vertices closer than 1e-8
         meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
@@ -70,7 +77,26 @@ def _load(path: Path) -> list:
         raise InputError(f"{path}: has vertices without three coordinates; export it again as a mesh in space")
     if not all(np.isfinite(m.triangles).all() for m in meshes):
         raise InputError(f"{path}: has vertices that are not finite; repair the mesh or export it again")
+    if any(m.visual.kind == "texture" and m.visual.uv is not None and _texture(m) is None for m in meshes):
+        log.info("%s: has no texture that can be read for some faces; they have the colour of their material", path)
     return meshes
+
+
+def _check_gltf(path: Path) -> None:
+    """InputError for compressed glTF, which would be read as empty, and for more vertices than the file can hold."""
+    data = path.read_bytes()
+    if data[:4] == b"glTF":  # binary: a header of 12 bytes, then the length and kind of the first chunk, which is JSON
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    try:
+        gltf = parse_json(data.decode("utf-8-sig"), finite=False)
+        packed = COMPRESSIONS & {*gltf.get("extensionsRequired", [])}
+        zeros = max((a["count"] for a in gltf.get("accessors", []) if "bufferView" not in a), default=0)
+        if zeros > MAX_VERTICES:
+            raise ValueError(f"it declares {zeros} vertices without data")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: cannot be read as a mesh ({reason(error)}); export it again") from error
+    if packed:
+        raise InputError(f"{path}: is compressed ({', '.join(sorted(packed))}); export it without compression")
 
 
 def _sample_faces(files: Sequence[Path], meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -115,15 +141,21 @@ def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Floa
         vertex = torch.from_numpy(np.array(visual.vertex_colors[:, :3], np.float32)) / 255
         return (vertex[corner] * weight[..., None]).sum(1)
     material = getattr(visual, "material", None)
-    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # textures of glTF and of OBJ
-    image = next((image for image in images if image is not None), None)
+    image = _texture(mesh)
     if image is None or getattr(visual, "uv", None) is None:
         return _material_colour(material).expand(len(face), 3)
     uv = np.pad(np.array(visual.uv, np.float32), ((0, 0), (0, 1)))[:, :2]  # OBJ allows u without v
     uv = torch.from_numpy(np.where(np.abs(uv) < 1e6, uv, 0))  # also replaces NaN, which exporters write for empty faces
-    texels = torch.from_numpy(np.array(image.convert("RGB"), np.float32) / 255)
+    texels = torch.from_numpy(np.array(image.convert("RGB")))
     tint = _material_colour(material) if getattr(material, "baseColorFactor", None) is not None else torch.ones(3)
-    return _bilinear_lookup(texels, (uv[corner] * weight[..., None]).sum(1)) * tint
+    return _bilinear_lookup(texels, (uv[corner] * weight[..., None]).sum(1)) / 255 * tint
+
+
+def _texture(mesh):
+    """The image of a mesh with texture coordinates, or None."""
+    material = getattr(mesh.visual, "material", None)
+    images = (getattr(material, key, None) for key in ("baseColorTexture", "image"))  # of glTF, of OBJ
+    return next((image for image in images if image is not None), None)
 
 
 def _material_colour(material) -> Float[Tensor, "3"]:
@@ -136,8 +168,8 @@ def _material_colour(material) -> Float[Tensor, "3"]:
     return torch.full((3,), 0.6)
 
 
-def _bilinear_lookup(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
-    """Bilinear texture lookup with u to the right and v up, repeating outside 0..1."""
+def _bilinear_lookup(texels: UInt8[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
+    """Bilinear texture lookup with u to the right and v up, repeating outside 0..1; values 0..255."""
     h, w = texels.shape[:2]
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     i, j = x.floor(), y.floor()

@@ -1,5 +1,7 @@
 """Conversion of meshes: textured boxes, colours, glTF, parts, inverted faces, units and invalid files."""
 
+import json
+import logging
 import sys
 
 import numpy as np
@@ -127,6 +129,25 @@ def test_gltf_is_y_up_and_its_scene_graph_is_applied(tmp_path, trimesh):
     torch.testing.assert_close(g.means.amax(0) - g.means.amin(0), torch.tensor([0.25, 0.25, 1.0]), rtol=0, atol=0.01)
     assert not (g.means[:, 2].abs() < 0.24).any()
     torch.testing.assert_close(rgb(g).mean(0), torch.tensor([0.2, 0.4, 0.8]), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "is compressed .KHR_draco_mesh_compression.; export it w"),
+    ({"accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}, "10000000000 vertices without"),
+    ({"accessors": 3}, "cannot be read as a mesh"),
+])  # fmt: skip
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_gltf_that_would_be_read_as_empty_is_rejected(tmp_path, trimesh, suffix, change, words):
+    path = tmp_path / f"box.{suffix}"
+    files = trimesh.Scene(trimesh.creation.box()).export(file_type=suffix)
+    if suffix == "glb":
+        length = int.from_bytes(files[12:16], "little")
+        text, rest = json.dumps(json.loads(files[20 : 20 + length]) | change).encode(), files[20 + length :]
+        path.write_bytes(files[:12] + len(text).to_bytes(4, "little") + b"JSON" + text + rest)
+    else:
+        path.write_text(json.dumps(json.loads(files["model.gltf"]) | change))
+    with pytest.raises(InputError, match=f"box.{suffix}: .*{words}"):
+        read_mesh(path, 1000)
 
 
 def test_conversion_is_deterministic(tmp_path):
@@ -303,12 +324,18 @@ def test_units_do_not_matter(tmp_path, size, at):
     assert sides_of(g) == pytest.approx([1, 0.5, 0.5], abs=0.01) and g.scales.isfinite().all()
 
 
-def test_missing_textures_leave_the_colour_of_the_material(tmp_path):
+def test_missing_textures_leave_the_colour_of_the_material(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "stages")
     (tmp_path / "box.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.8\nmap_Kd absent.png\n")
     for first, colour in (("mtllib box.mtl\nusemtl skin\n", [0.2, 0.4, 0.8]), ("", [0.6] * 3)):
         (tmp_path / "box.obj").write_text(first + "\n".join(obj_box()))
         g = read_mesh(tmp_path / "box.obj", 1000, light=False)
         torch.testing.assert_close(rgb(g).mean(0), torch.tensor(colour), rtol=0, atol=0.01)
+    assert "no texture" not in caplog.text  # without texture coordinates there is nothing to miss
+    text = "mtllib box.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
+    (tmp_path / "one.obj").write_text(text)
+    assert rgb(read_mesh(tmp_path / "one.obj", 200, light=False)).mean(0).tolist() == pytest.approx([0.2, 0.4, 0.8])
+    assert "one.obj: has no texture that can be read for some faces" in caplog.text
 
 
 @pytest.mark.parametrize("corners", ["vt 0.25\nvt 0.25\nvt 0.25", "vt nan 0\nvt inf 0\nvt 3e38 0"])

@@ -14,6 +14,7 @@ from stages.core.backends import load
 from stages.core.errors import InputError
 from stages.core.scene.files import check_json_output, check_output, must_exist, provenance, replacing
 from stages.core.scene.formats import FORMATS
+from stages.core.torch_state import standard_torch
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result, format_table, to_json
 
@@ -40,6 +41,7 @@ OPTION_KINDS = {  # option -> kinds of data to which it applies; other options a
 DEFAULTS = EvaluateOptions()
 
 
+@standard_torch()
 def run(
     prediction: Path | Sequence[Path], truth: Path | None, out: Path | None = None,
     options: EvaluateOptions = DEFAULTS, as_json: bool = False,

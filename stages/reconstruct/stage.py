@@ -11,6 +11,7 @@ from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import check_output, ngff_version, provenance, seconds_since, sha256
 from stages.core.scene.scene_ply import write_scene
+from stages.core.torch_state import standard_torch
 from stages.reconstruct.options import BACKENDS, SINGLE_PHOTO_BACKENDS, ReconstructOptions
 from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import Photos, Reconstruction
@@ -44,6 +45,7 @@ class Report:
     advice: list[str]
 
 
+@standard_torch()
 def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions()) -> Report:  # noqa: B008 -- frozen
     """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 

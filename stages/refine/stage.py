@@ -24,6 +24,7 @@ from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.torch_state import standard_torch
 from stages.refine.background import fill_background
 from stages.refine.disc_gaussians import empty_like
 from stages.refine.options import BACKENDS, CONCURRENT, RefineOptions
@@ -32,6 +33,7 @@ from stages.refine.outliers import floaters
 log = logging.getLogger(__name__)
 
 
+@standard_torch()
 def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen
     """Remove outliers, complete objects, and fill the background under them: labelled.ply -> refined.ply.
 

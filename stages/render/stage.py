@@ -9,6 +9,7 @@ from pathlib import Path
 from stages.core.backends import load, pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import check_output, provenance, replacing
+from stages.core.torch_state import standard_torch
 from stages.render.animation import open_animation
 from stages.render.background import open_background
 from stages.render.options import OUTPUT_FORMATS, RenderOptions
@@ -17,6 +18,7 @@ from stages.render.renderer import Clip, Renderer
 MAX_FILES = 8  # most files that are rendered side by side
 
 
+@standard_torch()
 def run(
     source: Path | Sequence[Path],
     out: Path | None = None,

@@ -13,12 +13,14 @@ from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.schema import quote, text
+from stages.core.torch_state import standard_torch
 from stages.segment.object_scale import parse_object_scale
 from stages.segment.options import BACKENDS, SegmentOptions
 
 log = logging.getLogger(__name__)
 
 
+@standard_torch()
 def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> None:  # noqa: B008 -- frozen
     """Label the Gaussians of each object: scene.ply -> labelled.ply. Logs one line per object.
 

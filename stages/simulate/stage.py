@@ -22,6 +22,7 @@ from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
+from stages.core.torch_state import standard_torch
 from stages.simulate.engine_choice import for_engine, with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.plausibility import PlausibilityMonitor
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 MIN_EXTENT = 1e-5  # smallest extent of an object, relative to its coordinates, which have 24 bits of precision
 
 
+@standard_torch()
 def run(
     scene: Path, out: Path,
     options: SimulateOptions = SimulateOptions(),  # noqa: B008 -- frozen

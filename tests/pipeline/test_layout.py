@@ -14,6 +14,7 @@ CORE = [
     "errors",
     "backends",
     "options",
+    "torch_state",
     "geometry",
     "scene",
     "kernels",

@@ -6,10 +6,17 @@ Python.
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import Any
+import math
+import operator
+import os
+from collections.abc import Iterable
+from dataclasses import Field, field, fields
+from numbers import Number
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
 from stages.core.backends import MAX_SEED
+from stages.core.errors import InputError
 
 
 def option(default: Any, help: str, *flags: str, **limits: Any) -> Any:
@@ -39,3 +46,64 @@ def photos_option(backends: str) -> Any:
 def download_option(backends: str) -> Any:
     """The field `download` of a stage in which these backends have published weights."""
     return option(False, f"for {backends}: download missing weights, after logging size and licence")
+
+
+def check_types(options: Any) -> None:
+    """Convert the `option` fields of an object to their types, where Python callers give others that mean the same.
+
+    Whole floats and NumPy's numbers become int and float, text a Path, a list or a single value a tuple. For the
+    `__post_init__` of an option class. Raises InputError for other types, NaN, and numbers beyond the field's limits.
+    """
+    hints = get_type_hints(type(options))
+    for f in fields(options):
+        value, hint = getattr(options, f.name), hints[f.name]
+        if "help" in f.metadata and not (value is None and type(None) in get_args(hint)):
+            object.__setattr__(options, f.name, _converted(f, hint, value))
+
+
+def _converted(f: Field, hint: Any, value: Any) -> Any:
+    """A value in the type of its field: one of _KINDS, or a tuple of texts."""
+    if get_origin(hint) is tuple:
+        several = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
+        return tuple(_single(f, str, item) for item in (value if several else [value]))
+    return _single(f, next((kind for kind in get_args(hint) if kind in _KINDS), hint), value)
+
+
+def _single(f: Field, kind: type, value: Any) -> Any:
+    """One value in a type of _KINDS; numbers become text where text is expected, such as objects and heights."""
+    words, convert = _KINDS[kind]
+    name = f"--{f.name.replace('_', '-')} {value!r:.60}"
+    try:
+        made = convert(value)
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise InputError(f"{name}: give {words}") from error
+    low, high = f.metadata.get("min"), f.metadata.get("max")
+    if (low is not None and made < low) or (high is not None and made > high):
+        raise InputError(f"{name}: give {low}{' or more' if high is None else f' to {high}'}")
+    return made
+
+
+def _whole(value: Any) -> int:
+    return operator.index(int(value) if isinstance(value, float) and value.is_integer() else value)
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str) or math.isnan(value):
+        raise ValueError
+    return float(value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, (str, os.PathLike, Number)) and type(value).__name__ != "device":  # of PyTorch
+        raise TypeError
+    return str(value)
+
+
+# type of a field -> what it takes in words, and a conversion, which raises an error for values of other types
+_KINDS = {
+    bool: ("True or False", lambda value: {True: True, False: False}[value]),
+    int: ("a whole number", _whole),
+    float: ("a number", _number),
+    str: ("text", _text),
+    Path: ("a path", Path),
+}

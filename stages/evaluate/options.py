@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.options import option
+from stages.core.options import check_types, option
 
 MAX_FILMS_PER_QUESTION = 26  # most films in one question, as they are named by letters
 
@@ -39,6 +39,7 @@ class EvaluateOptions:
     seed: int = option(0, "with --judge: random seed of the order of the films", min=0)
 
     def __post_init__(self):
+        check_types(self)
         if self.frames is not None and self.frames < 1:
             raise InputError(f"--frames {self.frames}: give the number of frames to compare, 1 or more")
         if self.report is not None and Path(self.report).suffix.lower() not in (".html", ".htm"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.options import device_option, option, seed_option
+from stages.core.options import check_types, device_option, option, seed_option
 from stages.reconstruct.scale import parse_scale
 
 BACKENDS = {
@@ -89,6 +89,7 @@ class ReconstructOptions:
     device: str = device_option()
 
     def __post_init__(self):
+        check_types(self)
         if self.matcher not in FEATURE_EXTRACTORS:
             raise InputError(f"--matcher {self.matcher}: choose from {', '.join(FEATURE_EXTRACTORS)}")
         if self.backend == "classic" and (self.weights or self.download):

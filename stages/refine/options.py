@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stages.core.backends import Backend, describe, with_weights
 from stages.core.errors import InputError
-from stages.core.options import device_option, download_option, option, photos_option, seed_option
+from stages.core.options import check_types, device_option, download_option, option, photos_option, seed_option
 
 # a completer takes (scene, object id, ObservedSpace, Support | None, RefineOptions) and returns Gaussians to add
 BACKENDS = {
@@ -52,6 +52,7 @@ class RefineOptions:
     device: str = device_option()
 
     def __post_init__(self):
+        check_types(self)
         if self.completer == "library" and self.library is None:
             raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
         if self.library is not None and self.chosen != "library":

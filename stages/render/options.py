@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.options import device_option, option
+from stages.core.options import check_types, device_option, option
 from stages.core.scene.formats import suffixes
 
 VIEWS = "novel | orbit | input:K | all | path.json"
@@ -49,6 +49,7 @@ class RenderOptions:
     device: str = device_option()
 
     def __post_init__(self):
+        check_types(self)
         kind = self.view.partition(":")[0]
         if kind not in ("novel", "orbit", "all", "input") and not self.view.lower().endswith(".json"):
             raise InputError(f"--view {self.view}: choose from {VIEWS}")

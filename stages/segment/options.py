@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stages.core.backends import Backend, describe, with_weights
 from stages.core.errors import InputError
-from stages.core.options import device_option, download_option, option, photos_option, seed_option
+from stages.core.options import check_types, device_option, download_option, option, photos_option, seed_option
 from stages.core.perception.object_limits import GroupingOptions
 from stages.segment.object_scale import parse_object_scale
 
@@ -71,6 +71,7 @@ class SegmentOptions:
     device: str = device_option()
 
     def __post_init__(self):
+        check_types(self)
         if (self.masks is not None) + (self.boxes is not None) + bool(self.points) > 1:
             raise InputError("--masks, --boxes and --points: give one of them")
         if self._is_network and (self.masks is not None or self.points):

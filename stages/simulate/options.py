@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.options import device_option, option, seed_option
+from stages.core.options import check_types, device_option, option, seed_option
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ class SimulateOptions:
     device: str = device_option()
 
     def __post_init__(self):
+        check_types(self)
         if self.integrator not in INTEGRATORS:
             raise InputError(f"--integrator {self.integrator}: choose from {', '.join(INTEGRATORS)}")
         if self.integrator != "step" and self.engine in ENGINES and not ENGINES[self.engine].weights:

@@ -130,12 +130,17 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
         overlap.add(labels, found, judged)
         views += [LabelledView(view, labels, found, judged)] if options.report else []
     scores = overlap.scores()
+    if not scores.pixels:
+        raise InputError(f"{truth}: no pixel of the label images is compared: all are {IGNORE_LABEL}, or of objects "
+                         "that are not core in names.json")  # fmt: skip
     asked = [SceneObject(t, names[t].name if t in names else f"object_{t}") for t in scores.iou]
     rows = dict(zip(scores.iou, object_labels(asked), strict=True))
     parts = {rows[t]: {"IoU": iou, "pixels": scores.truth_pixels[t]} for t, iou in scores.iou.items()}
     notes = _notes(scene, scores, rows)
     if len(spare):
         notes.append("neither asked for nor held against the result: " + ", ".join(names[int(i)].name for i in spare))
+    if unnamed := sorted(scores.iou.keys() - names.keys()):
+        notes.append(f"labels that names.json does not name, counted as objects: {', '.join(map(str, unnamed))}")
     if absent := sorted({file.name for file in _label_images(truth)} - {file.name for file in files.values()}):
         notes.append(f"label images of photos that the scene has no camera for: {', '.join(absent)}")
     result = Result("labels", {**scores.summary(), "photos": len(files)}, parts, notes)
@@ -159,12 +164,13 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
 
 
 def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:
-    """Label images NAME.png of the cameras' photos NAME, by camera index. Raises InputError if there are none."""
+    """Label images a.png or a.jpg.png of the cameras' photos a.jpg, by camera index. Raises InputError if there are none."""
     if cameras is None or not len(cameras):
         raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
     images = {path.stem: path for path in _label_images(folder)}
     stems = [Path(name).stem for name in cameras.names]
-    files = {i: images[stem] for i, stem in enumerate(stems) if stem in images}
+    named = {i: images.get(stem, images.get(cameras.names[i])) for i, stem in enumerate(stems)}
+    files = {i: file for i, file in named.items() if file}
     if not files:
         raise InputError(f"{folder}: no label image is named as a photo of {prediction}, such as {stems[0]}.png")
     return files

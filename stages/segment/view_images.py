@@ -63,7 +63,7 @@ def _read(scene: Scene, view: int, file: Path, undistorted: bool) -> Float[Tenso
 
 
 def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
-    """The image file of each camera, matched by the name of its photo without suffix.
+    """The image file of each camera, matched by the name of its photo a.jpg: a.png or a.jpg.png.
 
     `what` (the kind of image) and `option` (which names the folder) are for error messages. Raises InputError if there
     is no folder or no matching image.
@@ -72,7 +72,8 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; {option} takes a folder of {what}s named as the photos")
     images = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
-    found = {i: images[Path(name).stem] for i, name in enumerate(names) if Path(name).stem in images}
+    named = {i: images.get(Path(name).stem, images.get(name)) for i, name in enumerate(names)}
+    found = {i: file for i, file in named.items() if file}
     if not found:
         raise InputError(
             f"{folder}: no {what} is named as a photo of the scene, such as {Path(names[0]).stem}.png"

@@ -197,6 +197,19 @@ def test_suffixes_have_any_case_and_hidden_files_do_not_count(labelled):
     assert facts["objects"] == expected["objects"] and facts["notes"] == expected["notes"]
 
 
+def test_label_images_may_keep_the_suffix_of_their_photo(labelled):
+    expected = evaluate(labelled)
+    (labelled / "labels/a.b.png").rename(labelled / "labels/a.b.jpg.png")
+    assert evaluate(labelled)["objects"] == expected["objects"]
+
+
+def test_labels_without_a_name_are_told(labelled):
+    (labelled / "labels/names.json").write_text('{"1": "duck"}')
+    facts = evaluate(labelled)
+    assert "labels that names.json does not name, counted as objects: 2, 3" in facts["notes"]
+    assert facts["objects"]["object_2"]["IoU"] > 0.9
+
+
 def write_colour(path: Path) -> None:
     cv2.imwrite(str(path), np.zeros((*SIZE[::-1], 3), np.uint8))
 
@@ -215,6 +228,8 @@ def write_16_bits(path: Path) -> None:
         (lambda f: write_colour(f / "a.b.png"), "a.b.png: has 3 channels; a label image has one"),
         (lambda f: write_16_bits(f / "a.b.png"), "a.b.png: has 16 bits per pixel; save the label image with 8"),
         (lambda f: (f / "a.b.png").write_bytes(b"hello"), "a.b.png: is not an image"),
+        (lambda f: write_labels(f / "a.b.png", torch.from_numpy(picture(a_255=(0, 0, 64, 48)))),
+         "labels: no pixel of the label images is compared: all are 255"),
         (lambda f: write_labels(f / "a.b.png", torch.ones(50, 50, dtype=torch.int64)),
          "a.b.png: has 50x50 pixels, but the view a.b.jpg has 64x48"),
     ],

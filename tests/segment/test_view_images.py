@@ -17,6 +17,8 @@ def test_files_are_matched_by_name_without_suffix(tmp_path, caplog):
     assert not caplog.text
     assert match_files(tmp_path, ("c.jpg", "b.jpg", "x.jpg"), "mask", "--masks") == {1: tmp_path / "b.png"}
     assert "masks for 1 of 3 photos" in caplog.text
+    (tmp_path / "e.jpg.png").touch()  # as COLMAP and other tools name masks
+    assert match_files(tmp_path, ("e.jpg",), "mask", "--masks") == {0: tmp_path / "e.jpg.png"}
 
 
 def test_a_folder_without_a_matching_file_is_an_error(tmp_path):

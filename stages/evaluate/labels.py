@@ -164,7 +164,7 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
 
 
 def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:
-    """Label images a.png or a.jpg.png of the cameras' photos a.jpg, by camera index. Raises InputError if there are none."""
+    """Label images a.png or a.jpg.png of photos a.jpg, by camera index. Raises InputError if there are none."""
     if cameras is None or not len(cameras):
         raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
     images = {path.stem: path for path in _label_images(folder)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,14 +34,23 @@ MAX_PENDING_FRAMES = 8  # maximum number of video frames that wait for the encod
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Image files of a folder, sorted by name, without hidden files. Raises InputError if there are none."""
+    """Image files of a folder, without hidden files. Raises InputError if there are none.
+
+    They are sorted by name, with numbers in names compared by value: 9.png comes before 10.png.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give a folder of photos or a video file")
-    photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    photos = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not photos:
         raise InputError(f"{folder}: no photos in it; these formats are read: {' '.join(sorted(IMAGE_SUFFIXES))}")
-    return photos
+    return sorted(photos, key=_numbered_name)
+
+
+def _numbered_name(path: Path) -> tuple[list, str]:
+    """Sort key: the parts of a file's name, digits as numbers, then the name, since 01 and 1 are equal."""
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def read_image(path: Path) -> Float[Tensor, "h w 3"]:

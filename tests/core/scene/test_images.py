@@ -67,6 +67,14 @@ def test_list_photos_skips_other_and_hidden_files(tmp_path):
     assert [p.name for p in list_photos(tmp_path)] == ["a.png", "b.JPG"]
 
 
+def test_photos_are_sorted_by_the_numbers_in_their_names(tmp_path):
+    numbers = ["01.png", "1.png", "2.png", "\u0663.png", "10.png"]  # also an Arabic 3
+    names = [*numbers, "IMG.jpg", "IMG_2_b9.jpg", "IMG_2_b10.jpg", "IMG_11_a1.jpg"]
+    for name in reversed(names):
+        (tmp_path / name).touch()
+    assert [p.name for p in list_photos(tmp_path)] == names
+
+
 def test_video_is_h264_with_leading_index(tmp_path):
     path = tmp_path / "v.mp4"
     shades = [0.2, 0.5, 0.8]

@@ -5,9 +5,11 @@ import math
 import mujoco
 import numpy as np
 import pytest
-import torch
 
-from stages.lab.assets.shapes import Surface
+from stages.lab.bench.experiments.bodies import polyhedron
+from stages.lab.bench.experiments.catalogue import experiments
+from stages.lab.bench.motion_options import PhysicsBenchOptions
+from stages.lab.bench.physics import measure
 from stages.simulate.face_contacts import CUBE, FaceContacts, clipped_faces
 from tests.simulate.test_rigid import roll
 
@@ -99,18 +101,6 @@ def test_a_tilted_box_on_another_touches_along_its_lower_edge(kinds, tilt):
     assert depth == pytest.approx([1e-3] * len(depth), rel=1e-3)
 
 
-def random_polyhedron(corners: np.ndarray, count: int, seed: int) -> Surface:
-    """Random points on the convex hull of corners [m]."""
-    from scipy.spatial import ConvexHull  # noqa: PLC0415 -- of the tests only this needs it
-
-    hull, rng = ConvexHull(corners), np.random.default_rng(seed)
-    t = corners[hull.simplices]
-    area = np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    x = (rng.dirichlet((1, 1, 1), count)[..., None] * t[face]).sum(1)
-    return Surface(torch.from_numpy(x).float(), torch.from_numpy(hull.equations[face, :3]).float())
-
-
 def test_a_prism_on_a_slope_below_the_angle_of_friction_stays(tmp_path):
     """Of six sides, on a wedge of 15 degrees, whose tangent is .268; it crept by 3 % of its size a second."""
     degrees, ramp = 15.0, 0.5 * math.tan(math.radians(15.0))
@@ -118,17 +108,11 @@ def test_a_prism_on_a_slope_below_the_angle_of_friction_stays(tmp_path):
     turn = np.pi / 3 * np.arange(6)
     prism = np.array([[0.1 * np.cos(a), 0.1 * np.sin(a), z] for a in turn for z in (0.0, 0.15)])
     prism = turned(prism, "y", degrees) + [0, 0, ramp]
-    bodies = [random_polyhedron(corners, 2500, seed) for seed, corners in enumerate((wedge, prism))]
+    bodies = [polyhedron(corners, 2500, seed) for seed, corners in enumerate((wedge, prism))]
     t = roll(tmp_path, *bodies, pin=("1",), friction=0.4, steps=51)
     assert float((t.com[-1, 1] - t.com[0, 1]).norm()) < 1e-4
 
 
-def test_an_arch_of_wedges_stands(tmp_path):
-    """Half a ring of .3 to .42 m in seven parts: arches stand from a thickness of .107 mean radii on (Heyman 1969)."""
-    turn = np.pi / 7 * np.arange(8)
-    ring = np.stack([np.cos(turn), np.zeros(8), np.sin(turn)], 1)
-    sides = np.array([0.0, 0.05, 0.0])
-    corners = [np.array([r * ring[k] + y * sides for r in (0.3, 0.42) for k in (i, i + 1) for y in (-1, 1)])
-               for i in range(7)]  # fmt: skip
-    t = roll(tmp_path, *(random_polyhedron(c, 1500, i) for i, c in enumerate(corners)), friction=0.7, steps=51)
-    assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3
+def test_an_arch_of_wedges_stands():
+    experiment = experiments()["stack/arch of wedges"]
+    assert measure(experiment, "rigid", PhysicsBenchOptions())["value"] < 0.01

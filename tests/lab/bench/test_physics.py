@@ -5,11 +5,14 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
+from scipy.special import ellipk
 
 from stages.core.errors import InputError
 from stages.core.physics import solid_surface
 from stages.lab.bench.experiments.catalogue import experiments
 from stages.lab.bench.experiments.friction import ladder_angle, leaning_angle
+from stages.lab.bench.experiments.impacts import flip_time
 from stages.lab.bench.motion_options import PhysicsBenchOptions
 from stages.lab.bench.physics import chosen, measure, run
 from stages.simulate.options import QUALITIES, MpmQuality
@@ -98,7 +101,7 @@ def test_auto_is_measured_with_the_engine_that_it_takes(tmp_path):
 def test_experiments_are_chosen_by_groups_and_patterns():
     assert not any("," in name for name in ALL)  # commas separate names in --only
     names = [e.name for e in chosen("roll, tower/3*")]
-    assert names == ["roll/10deg", "roll/25deg", "tower/3 for 2s"]
+    assert names == ["roll/10deg", "roll/25deg", "roll/groove", "tower/3 for 2s"]
     assert len(chosen("")) == len(ALL)
 
 
@@ -107,3 +110,14 @@ def test_unknown_experiments_and_engines_are_errors():
         chosen("slide,jump")
     with pytest.raises(InputError, match="--engine warp"):
         PhysicsBenchOptions(engines=("warp",))
+
+
+def test_a_body_that_spins_about_its_middle_axis_flips_after_a_time_given_by_elliptic_integrals():
+    """Moments 1, 2, 3 and momentum (l, m, 0), with L^2 < 2 E I_2: its middle component is that of Jacobi's sn, at a
+    maximum at first and 0 after a quarter of a period. Source: Landau and Lifshitz, "Mechanics", section 37.
+    """
+    square, twice_energy = 0.1**2 + 2.0**2, 0.1**2 / 1 + 2.0**2 / 2
+    rate = math.sqrt((2 - 1) * (3 * twice_energy - square) / (1 * 2 * 3))
+    modulus = (3 - 2) * (square - 1 * twice_energy) / ((2 - 1) * (3 * twice_energy - square))
+    found = flip_time(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.1, 2.0, 0.0]))
+    assert found == pytest.approx(float(ellipk(modulus)) / rate, rel=1e-3)

@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
@@ -108,6 +110,16 @@ def compound(spacing: float, *boxes: tuple[tuple[float, float, float], tuple[flo
         return box(sides, spacing).moved(centre), lambda p: ((p - torch.tensor(centre)).abs() < half).all(1)
 
     return union(*(part(*each) for each in boxes))
+
+
+def polyhedron(corners: np.ndarray, count: int, seed: int = 0) -> Surface:
+    """Random points on the convex hull of corners (v, 3) [m], as many on each area."""
+    hull, rng = ConvexHull(corners), np.random.default_rng(seed)
+    t = corners[hull.simplices]
+    area = np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    points = (rng.dirichlet((1, 1, 1), count)[..., None] * t[face]).sum(1)
+    return Surface(torch.from_numpy(points).float(), torch.from_numpy(hull.equations[face, :3]).float())
 
 
 def about_z(surface: Surface, degrees: float) -> Surface:

@@ -94,6 +94,17 @@ def rolls() -> Iterator[Experiment]:
                          "distance in .6 s [m]", distance, TOLERANCES)  # fmt: skip
 
 
+def grooves() -> Iterator[Experiment]:
+    """A ball in a groove of 90 degrees that slides until it rolls; the axis of its turn is r / sqrt(2) away."""
+    radius, at = 0.05, (-0.21 + 0.05, -0.15, 0.04 + 0.05)
+    wall = compound(0.012, ((0.5, 0.4, 0.04), (0.0, 0.0, 0.02)), ((0.04, 0.4, 0.36), (-0.23, 0.0, 0.22)))
+    bodies = (tilted(body, -45).moved((0, 0, 0.5)) for body in (wall, ellipsoid((radius,) * 3, 1500).moved(at)))
+    run = Run(tuple(Specimen(body, loss=0.02) for body in bodies),
+              {"pin": ("1",), "friction": 0.8, "velocity": ("object=2 0,.4,0",), "steps": 31})  # fmt: skip
+    yield Experiment("roll/groove", (run,), lambda t: float(t.com[-1, 1, 1] - t.com[-11, 1, 1]) / (0.2 * 0.4), 1 / 1.8,
+                     "speed, 1 before", 1.0, TOLERANCES)  # fmt: skip
+
+
 def rocking() -> Iterator[Experiment]:
     """A block released while leaning on a lower edge: it rotates about the edge like an inverted pendulum."""
     width, height, start, time = 0.2, 0.3, math.radians(12), 0.14

@@ -10,8 +10,9 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from stages.core.geometry.rotations import matrix
 from stages.core.scene.trajectory import Trajectory
-from stages.lab.bench.experiments.bodies import Run, ball, cube
+from stages.lab.bench.experiments.bodies import Run, ball, block, cube
 from stages.lab.bench.experiments.experiment import TOLERANCES, Experiment, G
 from stages.lab.bench.experiments.measures import largest_difference, largest_shift, path, rebound, spin
 
@@ -40,6 +41,37 @@ def torques() -> Iterator[Experiment]:
         yield Experiment(f"push/{name}", (Run((body,), options),),
                          lambda t: float(path(t, 0)[-1, 0] - path(t, 0)[-2, 0]) / t.info.dt, 1.0, "speed [m/s]", 1.0,
                          TOLERANCES)  # fmt: skip
+
+
+def tumbling() -> Iterator[Experiment]:
+    """A box in free space that a push of 10 ms turns about its middle axis, and 5 % about its longest one: it flips."""
+    sides, push = torch.tensor([0.3, 0.2, 0.1]), 0.01
+    moments = 540.0 * sides.prod() / 12 * (sides.square().sum() - sides.square())
+    turn = moments * torch.tensor([0.5, 10.0, 0.0])
+    torque = ",".join(f"{float(v):.6g}" for v in turn / push)
+    body = block(tuple(sides.tolist()), (0.0, 0.0, 0.5))
+    run = Run((body,), {"gravity": 0.0, "force": (f"object=1 torque={torque} to={push}",), "dt": push, "steps": 101})
+
+    def flip(t: Trajectory) -> float:
+        middle = matrix(t.rotation[:, 0])[:, :, 1] @ (turn / turn.norm())
+        k = int((middle[1:] < 0).nonzero()[0])
+        return t.info.dt * (k + float(middle[k] / (middle[k] - middle[k + 1])))
+
+    yield Experiment("free space/flip", (run,), flip, push / 2 + flip_time(moments, turn), "time [s]", 1.0,
+                     TOLERANCES)  # fmt: skip
+
+
+def flip_time(moments: Tensor, momentum: Tensor) -> float:
+    """Time [s] after which a body has turned its middle axis across its angular momentum [kg m^2 / s].
+
+    Euler's equations, by the midpoint rule.
+    """
+    moments, x, step, time = moments.double(), momentum.double(), 1e-4, 0.0
+    while x[1] > 0:
+        middle = x + step / 2 * torch.linalg.cross(x, x / moments)
+        x = x + step * torch.linalg.cross(middle, middle / moments)
+        time += step
+    return time
 
 
 def invariance() -> Iterator[Experiment]:

@@ -6,10 +6,11 @@ import math
 from collections.abc import Iterator
 from itertools import product
 
+import numpy as np
 import torch
 
 from stages.lab.assets.shapes import box
-from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, bowl, cube, cylinder
+from stages.lab.bench.experiments.bodies import Run, Specimen, ball, block, bowl, cube, cylinder, polyhedron
 from stages.lab.bench.experiments.experiment import GAPS, TOLERANCES, Experiment
 from stages.lab.bench.experiments.measures import gap, largest_shift, overlap, path
 
@@ -35,6 +36,17 @@ def stacks() -> Iterator[Experiment]:
     yield Experiment("stack/heavy on soft", (Run(soft),), gap, 0.0, "gap [heights]", 1.0, GAPS)
     yield Experiment("stack/size 1:10", (Run(small),), gap, 0.0, "gap [heights]", 1.0, GAPS)
     yield Experiment("stack/rod on two boxes", (Run(rod),), lambda t: gap(t, 3, 1), 0.0, "gap [heights]", 1.0, GAPS)
+
+
+def arches() -> Iterator[Experiment]:
+    """Half a ring of seven wedges, .12 thick: it stands from .107 mean radii, here .039, on (Heyman 1969)."""
+    turn = np.pi / 7 * np.arange(8)
+    ring, across = np.stack([np.cos(turn), np.zeros(8), np.sin(turn)], 1), np.array([0.0, 0.05, 0.0])
+    corners = [np.array([r * ring[k] + y * across for r in (0.3, 0.42) for k in (i, i + 1) for y in (-1, 1)])
+               for i in range(7)]  # fmt: skip
+    wedges = tuple(Specimen(polyhedron(c, 1500, i)) for i, c in enumerate(corners))
+    yield Experiment("stack/arch of wedges", (Run(wedges, {"friction": 0.7}),), lambda t: largest_shift(t) / 0.12, 0.0,
+                     "largest shift [thicknesses]", 1.0, TOLERANCES)  # fmt: skip
 
 
 def piles() -> Iterator[Experiment]:

@@ -1,7 +1,7 @@
 """Contacts of the faces of convex bodies, in place of MuJoCo's.
 
 MuJoCo finds several contacts of two faces only if these are almost parallel. Bodies whose faces are inclined by the
-depth of their contacts then rest on one point, which jumps from one side to the other, and creep. Here the face of a
+depth of their contacts then rest on one point, which jumps from one side to the other, and creep. There the face of a
 body that is across MuJoCo's normal is clipped by the opposite face of the other one. Contacts of edges with edges stay
 MuJoCo's, and those with planes.
 
@@ -15,6 +15,7 @@ import numpy as np
 from stages.simulate.surface_contacts import AddedContacts, add_contacts, extremes
 
 PARALLEL = 6e-4  # 1 - cosine of the angle between faces that count as one, of which the largest is taken: 2 degrees
+ENOUGH = 3  # contacts of a pair from which on MuJoCo's cover an area
 ACROSS = 0.1  # least cosine between a face and the plane of the one that it touches
 ON_SIDE = 1e-5  # distance up to which points are on the side of a face [units of the simulation]
 CUBE = np.array([[[1, -1, -1], [1, 1, -1], [1, 1, 1], [1, -1, 1]]], float)
@@ -54,8 +55,8 @@ class FaceContacts:
         rows = np.flatnonzero(self._many[geom].all(1) & (data.contact.exclude == 0))
         number = geom[rows, 0] * model.ngeom + geom[rows, 1]
         order = rows[np.lexsort((data.contact.dist[rows], number))]
-        _, first = np.unique(np.sort(number), return_index=True)
-        deepest = order[first]  # of each pair
+        _, first, count = np.unique(np.sort(number), return_index=True, return_counts=True)
+        deepest = order[first[count < ENOUGH]]  # of each pair
         if not len(deepest):
             return
         pairs = geom[deepest].copy()

@@ -15,7 +15,7 @@ from stages.core.geometry.similarity import Similarity
 from stages.reconstruct.options import UP_SIDES
 
 # Minimum component of a plane's normal along the cameras' up axes (cosine of their pitch), and minimum weighted
-# fraction of the points on the plane; pairs are tried in this order.
+# fraction of the points on the plane; the first pair is preferred.
 PLANE_CRITERIA = ((0.5, 0.04), (0.05, 0.3))
 UPRIGHT_FACTOR = 1.5  # weight of a plane's fraction of points if photos are upright; squared if cameras look down on it
 LOOKS_DOWN = 0.25  # sine of the smallest mean pitch of cameras that look down
@@ -97,21 +97,31 @@ def _find_ground(
     """Find the supporting plane by RANSAC, for cameras that are held upright.
 
     Points are weighted by their distance from the focus, so that a table is preferred to the floor around it; most
-    cameras must be above the plane. Planes on which the cameras look down by less than 60 degrees are tried first:
-    steeper ones may be the front of a book, and need more points.
+    cameras must be above the plane. Planes that the cameras look down on by less than 60 degrees are preferred:
+    steeper ones may be the front of a book. They need more points, which then do not count for the others.
     """
     eyes = centres(viewmats)
     radius = float((eyes - focus).norm(dim=1).median())
     weights = _focus_weights(points, focus, radius)
-    for min_up, min_fraction in PLANE_CRITERIA:
-        found = ransac(points, 0.01 * radius, weights, lambda n, up=min_up: _plausible_up(n, viewmats, up), seed=seed)
+    (min_flat, flat_fraction), (min_steep, steep_fraction) = PLANE_CRITERIA
+
+    def supporting(min_up: float, min_fraction: float, free: Float[Tensor, "n"]) -> Ground | None:
+        """The plane with most of the weight `free` of the points, if it has enough of it."""
+        found = ransac(points, 0.01 * radius, free, lambda n: _plausible_up(n, viewmats, min_up), seed=seed)
         if found is None:
-            continue
-        plane, inside = _lowest_parallel_plane(points, weights, found[0], 0.01 * radius)
-        fraction = float(weights[inside].sum() / weights.sum())
-        above = float((plane.heights(eyes) > 0).float().mean())
-        if fraction >= min_fraction and above > 0.5:
-            return Ground(plane.normal, plane, focus, radius, fraction)
+            return None
+        plane, inside = _lowest_parallel_plane(points, free, found[0], 0.01 * radius)
+        fraction = float(free[inside].sum() / weights.sum())
+        good = fraction >= min_fraction and float((plane.heights(eyes) > 0).float().mean()) > 0.5
+        return Ground(plane.normal, plane, focus, radius, fraction) if good else None
+
+    free, steep = weights, supporting(min_steep, steep_fraction, weights)
+    if steep is not None and not _plausible_up(steep.up[None], viewmats, min_flat):
+        # photos straight down on a table: slanted planes through it have some of its points
+        free = weights.masked_fill(steep.plane.heights(points).abs() < 0.02 * radius, 0.0)
+    flat = supporting(min_flat, flat_fraction, free)
+    if flat or steep:
+        return flat or steep
     return Ground(up_from_cameras(viewmats), None, focus, radius)
 
 

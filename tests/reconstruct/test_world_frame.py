@@ -112,6 +112,18 @@ def test_scale_of_given_cameras_is_kept():
     assert world_frame.to_world(ground, points, viewmats, metric=True).scale == 1.0
 
 
+def test_a_table_seen_from_above_is_the_floor():
+    """A slanted plane through the table and the things on it looks more like one that the cameras look down on."""
+    generator = torch.Generator().manual_seed(0)
+    rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
+    table = rand(6000) * torch.tensor([0.6, 0.5, 0])
+    things = rand(6000) * torch.tensor([0.4, 0.3, 0.15]) + torch.tensor([0, 0, 0.075])
+    eyes = torch.tensor([[x, y, 0.9] for x in (-0.2, 0.0, 0.2) for y in (-0.15, 0.0, 0.15)])
+    viewmats = look_at(eyes, eyes * torch.tensor([0.8, 0.8, 0]) + torch.tensor([0, 0.1, 0]))
+    ground = world_frame.find_ground(torch.cat([table, things]), viewmats, torch.zeros(3))
+    assert float(ground.up[2]) > 0.999 and abs(float(ground.plane.offset)) < 0.01
+
+
 def test_wall_is_not_a_floor():
     # For an object on a wall and horizontal cameras there is no floor, and up is the up axis of the cameras.
     generator = torch.Generator().manual_seed(0)

@@ -35,14 +35,17 @@ def extract_features(progress: Progress, folder: str, names: list[str], threads:
                               device=pycolmap.Device.cpu)  # fmt: skip
 
 
-def map_photos(progress: Progress, folder: str, database: str, photos: int, seed: int) -> None:
+def map_photos(progress: Progress, folder: str, database: str, photos: int, seed: int, min_points: int) -> None:
     """Write the models that COLMAP's incremental mapper finds to the folders 0, 1, ... in `folder`.
+
+    A photo is added if it shows at least `min_points` of the points of the model.
 
     Principal points are at the centres of the photos. If refined ones explain the best model clearly better, because
     photos were cropped, all photos are mapped again with these, and the cameras in the database are changed.
     """
     pycolmap = import_pycolmap()
     options = _mapper_options(photos, seed)
+    options.mapper.abs_pose_min_num_inliers = min_points
 
     def mapped(show: Progress) -> dict:
         return pycolmap.incremental_mapping(

@@ -37,6 +37,7 @@ from stages.reconstruct.step_cache import StepCache
 log = logging.getLogger(__name__)
 MIN_FITTING = 0.2  # smallest fraction of the matches that given cameras must explain
 MIN_IMAGE_MOTION = 0.005  # smallest median displacement of matches of a moving camera [photo size]
+MIN_POINTS = 30, 15  # points of the model that a photo must show to be added; the second if the first leaves out most
 MAX_MAPPED_TWICE = 40  # most photos that are mapped twice; another mapping of 50 photos takes half a minute
 CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
@@ -84,12 +85,16 @@ def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
     found = []
-    for models in _mapped_from_starts(photos, database, seed, second):
-        best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
-        if best is not None and best.num_reg_images() >= 2 and best.num_points3D() >= 50:
-            found.append((best, models))
+    for min_points in MIN_POINTS:
+        for models in _mapped_from_starts(photos, database, seed, min_points, second):
+            best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+            if best is not None and best.num_reg_images() >= 2 and best.num_points3D() >= 50:
+                found.append((best, models))
+        if any(2 * best.num_reg_images() > len(photos) for best, _ in found):
+            break
     if not found:
-        raise InputError(f"{photos.source}: {_failure_reason(len(photos), len(pairs))}")
+        matches = float(np.median([len(a) for _, _, a, _ in pairs]))
+        raise InputError(f"{photos.source}: {_failure_reason(len(photos), len(pairs), matches)}")
     best, models = max(found, key=lambda one: _quality(one[0]))
     model = _from_colmap(best, _drop_reasons(photos, pairs, best, models))
     log.info(
@@ -107,7 +112,9 @@ def _quality(model) -> tuple[int, float]:
     return model.num_reg_images(), -model.compute_mean_reprojection_error()
 
 
-def _mapped_from_starts(photos: Photos, database: Path, seed: int, second: SecondProcess | None) -> list[list]:
+def _mapped_from_starts(
+    photos: Photos, database: Path, seed: int, min_points: int, second: SecondProcess | None
+) -> list[list]:
     """Models mapped from the first of FOCAL_STARTS and, in parallel in a second process, from the second one."""
     starts = FOCAL_STARTS if second else FOCAL_STARTS[:1]
     with (
@@ -118,25 +125,39 @@ def _mapped_from_starts(photos: Photos, database: Path, seed: int, second: Secon
         for copy, factor in zip(copies, starts, strict=True):
             shutil.copyfile(database, copy)
             matching.set_unknown_focals(copy, factor)
-        beside = [second.thread.submit(_mapped, photos, copy, seed, bar.update, second.process) for copy in copies[1:]]
-        return [_mapped(photos, copies[0], seed, bar.update), *(run.result() for run in beside)]
+        args = seed, min_points, bar.update
+        beside = [second.thread.submit(_mapped, photos, copy, *args, second.process) for copy in copies[1:]]
+        return [_mapped(photos, copies[0], *args), *(run.result() for run in beside)]
 
 
-def _mapped(photos: Photos, database: Path, seed: int, progress: Callable, process: Popen | None = None) -> list:
+def _mapped(
+    photos: Photos, database: Path, seed: int, min_points: int, progress: Callable, process: Popen | None = None
+) -> list:
     """Run COLMAP's incremental mapper; returns a pycolmap model for each connected set of photos."""
     import pycolmap
 
     with tempfile.TemporaryDirectory() as folder:
         with features.writing_database(Path(folder)):
-            run_colmap("map", folder, progress, process, database=str(database), photos=len(photos), seed=seed)
+            run_colmap(
+                "map", folder, progress, process, database=str(database), photos=len(photos), seed=seed,
+                min_points=min_points,
+            )  # fmt: skip
         return [pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())]
 
 
-def _failure_reason(photos: int, pairs: int) -> str:
-    """The likely reason why mapping failed, from the number of matching pairs: little overlap or wrong matches."""
+def _failure_reason(photos: int, pairs: int, matches: float) -> str:
+    """The likely reason why mapping failed: little overlap, little detail, or wrong matches.
+
+    `pairs` is the number of matching pairs of photos, `matches` the median number of matches of a pair.
+    """
+    known = "or give known cameras (--cameras)"
     if pairs < 2 * photos:
-        what = "the photos overlap too little to find where they were taken from"
-        return f"{what}; {CAPTURE_ADVICE}, or give known cameras (--cameras)"
+        return f"the photos overlap too little to find where they were taken from; {CAPTURE_ADVICE}, {known}"
+    if matches < MIN_POINTS[0]:
+        return (
+            f"{pairs} pairs of photos match, but half of them at {matches:.0f} points or fewer: put patterned, matt "
+            f"things (newspaper, a cloth) under and around the objects, use more light, and take more photos, {known}"
+        )
     return (
         f"{pairs} pairs of photos match, but no camera positions explain the matches; where a pattern repeats "
         "(tiles, a checked cloth) its parts are confused: cover it, with newspaper for instance; where cameras are far "

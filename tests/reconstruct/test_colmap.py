@@ -89,7 +89,7 @@ def test_principal_points_off_the_middle_are_found_from_ten_photos_on(tmp_path, 
         database.update_camera(camera)
     database.close()
     done = []
-    colmap_worker.map_photos(done.append, str(out), str(path), photos, seed=0)
+    colmap_worker.map_photos(done.append, str(out), str(path), photos, seed=0, min_points=30)
     model = pycolmap.Reconstruction(out / "0")
     (camera,) = model.cameras.values()
     assert sum(done) == model.num_reg_images() == photos

@@ -83,6 +83,18 @@ def test_many_photos_and_those_with_a_known_focal_length_are_mapped_once(tmp_pat
     assert len(runs) == 2 + 1 + 1
 
 
+def test_photos_with_few_points_are_added_where_most_would_be_left_out(tmp_path, monkeypatch):
+    true = arc(5, (320, 240), sweep=60.0)
+    photos = as_photos([photograph(true, i)[0] for i in range(5)], true.names, tmp_path)
+    monkeypatch.setattr(sfm, "MIN_POINTS", (10_000,))  # more than there are
+    with pytest.raises(InputError):
+        sfm.estimate_cameras(photos)
+    monkeypatch.setattr(sfm, "MIN_POINTS", (10_000, 15))
+    model = sfm.estimate_cameras(photos)
+    assert len(model.cameras) == 5
+    assert max_position_error(model, true) < 0.03
+
+
 def test_of_models_with_as_many_photos_that_of_the_smaller_error_is_better():
     def model(photos: int, error: float) -> SimpleNamespace:
         return SimpleNamespace(num_reg_images=lambda: photos, compute_mean_reprojection_error=lambda: error)

@@ -106,9 +106,10 @@ def test_known_cameras_work_above_a_table_whose_pattern_repeats(tmp_path, monkey
 
 
 def test_failure_reason_by_number_of_pairs():
-    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # only neighbours match
-    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # for example by a checked tablecloth
-    assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3)
+    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30, matches=100)  # neighbours only
+    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162, matches=100)  # checked tablecloth
+    assert "more light" in sfm._failure_reason(photos=16, pairs=36, matches=21)  # a plain bear on a dark table
+    assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3, matches=100)
 
 
 def test_mutual_matches():

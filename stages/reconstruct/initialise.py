@@ -140,11 +140,13 @@ def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], ra
 
 
 def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Hash of the voxel of each point; its side is the power of two nearest to `size`."""
+    """A number for the voxel of each point, whose side is the power of two nearest to `size`.
+
+    Different voxels have different numbers, unless they are 2^19 sides or 64 levels apart.
+    """
     level = size.log2().round()
-    index = (points / 2.0 ** level[:, None]).floor().long()
-    hashed = index[:, 0] * 73856093 ^ index[:, 1] * 19349663 ^ index[:, 2] * 83492791  # Teschner et al. 2003
-    return hashed * 64 + (level.long() & 63)
+    x, y, z = ((points / 2.0 ** level[:, None]).floor().long() & (2**19 - 1)).unbind(1)
+    return ((x << 19 | y) << 19 | z) << 6 | level.long() & 63
 
 
 def fill_unmatched(

@@ -68,6 +68,14 @@ def test_downsampling_is_finer_in_focus():
     assert near.sum() / (before < 0.2).sum() > 2 * far.sum() / (before > 0.8).sum()
 
 
+def test_different_voxels_are_not_mixed():
+    """The mean of points on two sides of the scene would be a point in front of the cameras."""
+    index = torch.arange(-20.0, 20)
+    points = torch.cartesian_prod(index, index, index) + 0.5
+    cells = torch.cat([initialise._cells(points, torch.full((1,), side)) for side in (1.0, 2.0)])
+    assert len(cells.unique()) == 40**3 + 20**3
+
+
 def test_point_before_a_surface_violates_free_space(block):
     viewmat = block.views.cameras.viewmats[0]
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]

@@ -107,7 +107,8 @@ def _find_ground(
 
     def supporting(min_up: float, min_fraction: float, free: Float[Tensor, "n"]) -> Ground | None:
         """The plane with most of the weight `free` of the points, if it has enough of it."""
-        found = ransac(points, 0.01 * radius, free, lambda n: _plausible_up(n, viewmats, min_up), seed=seed)
+        allowed = lambda n: _plausible_up(n, viewmats, min_up)  # noqa: E731
+        found = ransac(points, 0.01 * radius, free, allowed, seed=seed) if free.any() else None
         if found is None:
             return None
         plane, inside = _lowest_parallel_plane(points, free, found[0], 0.01 * radius)

@@ -107,7 +107,9 @@ def test_one_photo_is_enough(tmp_path):
 
 def test_no_floor_without_a_supporting_plane(tmp_path, monkeypatch):
     assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
-    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # rejects all planes
+    monkeypatch.setattr(
+        "stages.reconstruct.world_frame.PLANE_CRITERIA", ((0.5, 2.0), (0.05, 2.0))
+    )  # no plane is accepted
     made, _ = assembled(tmp_path, count=2, iterations=0)
     assert made.scene.floor is None
     assert any("no table or floor" in sentence for sentence in made.advice)

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -28,6 +30,8 @@ from stages.reconstruct.sfm import SparseModel
 MAX_SOURCES = 4  # source views matched with each view
 MAX_CHECK_VIEWS = 10  # views against which the depth of each view is checked
 MAX_LABELS = 192  # depth hypotheses per pixel
+WINDOW = 5  # side of the windows that are correlated [px]
+MIN_CORRELATION = 0.3  # smallest correlation of a match
 STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # P1 and P2 of semi-global matching, for costs 0..1
 DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # consistent depths: relative difference, and reprojection error [px]
 REFINE_STEPS = (0.5, 0.2)  # step of each refinement round [steps of the hypothesis grid]
@@ -37,7 +41,10 @@ MOVE_COST = 0.02  # cost added per refinement step away from the current depth
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth along the viewing axis of one view [scene units]; `support` is the number of consistent other views."""
+    """Depth along the viewing axis of one view [scene units].
+
+    `support` is the number of consistent other views, or -1 in a backdrop without matches, whose depth is unknown.
+    """
 
     depth: Float[Tensor, "h w"]
     support: Float[Tensor, "h w"]
@@ -47,14 +54,17 @@ def estimate_depth_maps(views: Views, model: SparseModel, plane: Plane | None, d
     """Estimate a depth map of every view and check it against the others; `plane`: the supporting plane, if known."""
     checks = select_sources(model, MAX_CHECK_VIEWS)
     sources = [best[:MAX_SOURCES] for best in checks]
-    raw = []
+    raw, scores = [], []
     for i in tqdm(range(len(views)), desc="matching depth", unit="photo", leave=False):
-        raw.append(_match_view(views, model, i, sources[i], plane, device))
+        depth, score = _match_view(views, model, i, sources[i], plane, device)
+        raw.append(depth)
+        scores.append(score)
     checked = []
     for i in range(len(views)):
         others = {*checks[i], *(j for j in range(len(views)) if i in sources[j])}
         found = check_consistency(raw, views, i, sorted(others))
-        checked.append(DepthMap(found.depth.cpu(), found.support.cpu()))
+        support = found.support.masked_fill(_backdrop(scores[i]) & ~_on_plane(raw[i], views, i, plane), -1.0)
+        checked.append(without_speckles(DepthMap(found.depth.cpu(), support.cpu())))
     return checked
 
 
@@ -86,8 +96,11 @@ def select_sources(model: SparseModel, count: int) -> list[list[int]]:
 
 def _match_view(
     views: Views, model: SparseModel, i: int, sources: list[int], plane: Plane | None, device: str
-) -> Float[Tensor, "h w"]:
-    """Depth of view i before the consistency check: plane sweep at half resolution, refined at full resolution."""
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Depth of view i before the consistency check: plane sweep at half resolution, refined at full resolution.
+
+    Also returns the correlation of the windows at this depth, from 0 to 1.
+    """
     half = _Stereo(views, i, sources, 0.5, device)
     low, high = _depth_range(views, model, i)
     labels = half.labels(low, high)
@@ -102,8 +115,8 @@ def _match_view(
     inverse = F.interpolate(inverse[None, None], full.size, mode="bilinear", align_corners=False)[0, 0]
     step = float(labels[1] - labels[0])
     for fraction in REFINE_STEPS:
-        inverse = _refined(full, inverse, fraction * step)
-    return 1 / inverse.clamp(min=float(labels[0]) / 2)
+        inverse, score = _refined(full, inverse, fraction * step)
+    return 1 / inverse.clamp(min=float(labels[0]) / 2), score
 
 
 def _depth_range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
@@ -251,8 +264,10 @@ def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
     return torch.where(best == centre[..., 0], best + fraction, best.to(fraction))
 
 
-def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
-    """Refine inverse depth by moving it up to two steps to the best match.
+def _refined(
+    stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Refine inverse depth by moving it up to two steps to the best match; also returns the correlation there.
 
     Every pixel is warped with its own depth, so windows follow slanted surfaces. Costs are averaged over a window and
     grow with the distance of the move, so areas without texture do not change.
@@ -260,12 +275,12 @@ def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Flo
     moves = torch.arange(-2, 3, device=inverse.device, dtype=inverse.dtype)
     hypotheses = (inverse + moves[:, None, None] * step).clamp_min(1e-6)
     cost = _box(stereo.cost(1 / hypotheses)) + MOVE_COST * moves.abs()[:, None, None]
-    best = cost.argmin(0, keepdim=True)
+    least, best = cost.min(0, keepdim=True)
     centre = best.clamp(1, 3)
     before, here, after = (cost.gather(0, centre + k) for k in (-1, 0, 1))
     fraction = ((before - after) / (2 * (before - 2 * here + after).clamp_min(1e-6))).clamp(-0.5, 0.5)
     move = torch.where(best == centre, best + fraction, best.to(fraction))[0] - 2
-    return inverse + move * step
+    return inverse + move * step, 1 - least[0]
 
 
 def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
@@ -289,6 +304,43 @@ def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int
         total += torch.where(agrees, z, torch.zeros_like(z))
         support += agrees
     return DepthMap(total / (1 + support), support)
+
+
+def _backdrop(score: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Pixels of areas without matches (by their correlation) that reach the border of the image.
+
+    Semi-global matching extends the depth of objects in front of a plain backdrop into it.
+    """
+    plain = (score < MIN_CORRELATION).cpu().numpy().astype(np.uint8)
+    window = np.ones((WINDOW, WINDOW), np.uint8)
+    _, area = cv2.connectedComponents(cv2.erode(plain, window))  # gaps in outlines do not join areas
+    border = np.unique(np.concatenate([area[0], area[-1], area[:, 0], area[:, -1]]))
+    open_areas = np.isin(area, border[border > 0]).astype(np.uint8)
+    return torch.from_numpy(cv2.dilate(open_areas, window) > 0).to(score.device)
+
+
+def _on_plane(depth: Float[Tensor, "h w"], views: Views, i: int, plane: Plane | None) -> Bool[Tensor, "h w"]:
+    """Pixels whose depth is within 3 % of that of the supporting plane, if there is one."""
+    if plane is None:
+        return torch.zeros_like(depth, dtype=torch.bool)
+    viewmat = views.cameras.viewmats[i]
+    _, points = unproject(depth, views.cameras.Ks[i].to(depth), viewmat.to(depth))
+    heights = points @ plane.normal.to(depth) - plane.offset
+    # along a ray heights are linear in depth
+    return heights.abs() < 0.03 * abs(float(plane.heights(centres(viewmat[None])[0])))
+
+
+def without_speckles(found: DepthMap) -> DepthMap:
+    """The map with a support of 0 in connected areas of consistent depth that are smaller than a window.
+
+    Where there is no texture, the depths of a few views agree by chance here and there.
+    """
+    step = 1000  # per unit of the logarithm
+    level = (found.depth / found.depth.median()).log().mul(step).round().clamp(-32000, 32000)
+    areas = level.masked_fill(found.support <= 0, -32768).cpu().numpy().astype(np.int16)
+    cv2.filterSpeckles(areas, -32768, WINDOW**2, round(step * DEPTH_TOLERANCE))
+    small = torch.from_numpy(areas == -32768).to(found.support.device)
+    return DepthMap(found.depth, torch.where(small, found.support.clamp(max=0), found.support))
 
 
 def unproject(

@@ -156,8 +156,9 @@ def fill_unmatched(
 
     Their depth is the first of these: that of the supporting plane, if points on the plane are near or the matched
     depth is close to it; the matched depth, if at least one view agrees; the depth interpolated from consistent pixels,
-    if these surround the pixel; and `far`, where a wrong point occludes nothing. Points in the free space in front of a
-    surface that a view confirms are moved to `far` too. The points are on the device of the depth maps.
+    if these surround the pixel and it is not in a backdrop; and `far`, where a wrong point occludes nothing. Points in
+    the free space in front of a surface that a view confirms are moved to `far` too. The points are on the device of
+    the depth maps.
     """
     views, clouds, device = observed.views, [], observed.maps[0].depth.device
     opaque = to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
@@ -165,7 +166,8 @@ def fill_unmatched(
     for i, m in enumerate(observed.maps):
         consistent = observed.consistent(i)
         away = torch.full_like(m.depth, far)
-        depth = torch.where(surrounded_pixels(consistent), interpolate_depth(m.depth, consistent), away)
+        hole = surrounded_pixels(consistent) & (m.support >= 0)
+        depth = torch.where(hole, interpolate_depth(m.depth, consistent), away)
         depth = torch.where(m.support >= 1, m.depth, depth)
         if on_plane is not None:
             depth = _depth_on_plane(views, i, depth, m.depth, on_plane)

@@ -48,7 +48,7 @@ def test_depth_does_not_depend_on_the_number_of_threads(block, with_threads):
     views, _, model = block
     plane = Plane(torch.tensor([0.0, 0, 1]), 0.0)
     first, second = (with_threads(n, stereo._match_view, views, model, 2, [1, 3], plane, "cpu") for n in (1, 2))
-    assert torch.equal(first, second)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 def test_sources_are_the_neighbours(block):
@@ -94,3 +94,35 @@ def test_unprojected_pixels_project_back(block):
     assert inside.float().mean() > 0.99
     torch.testing.assert_close(there[inside], points[inside], rtol=1e-4, atol=1e-3)
     assert pixels[0, 0].tolist() == [0.5, 0.5]
+
+
+def test_speckles_lose_their_support():
+    depth, support = torch.full((40, 60), 2.0), torch.zeros(40, 60)
+    support[5:15, 5:15] = 3  # a surface
+    support[20:24, 20:24] = 2  # agreement by chance
+    support[:, 50:] = -1  # a backdrop
+    support[30:36, 30:36], depth[30:36, 30:33] = 2, 1.0  # two neighbours at different depth
+    found = stereo.without_speckles(stereo.DepthMap(depth, support))
+    assert torch.equal(found.support[5:15, 5:15], support[5:15, 5:15])
+    assert int((found.support > 0).sum()) == 100 and (found.support[:, 50:] == -1).all()
+    assert torch.equal(found.depth, depth)
+
+
+def test_a_plain_backdrop_gets_no_depth():
+    """Areas without matches that reach the border of the image, however objects and the table bound them."""
+    score = torch.full((60, 80), 0.8)
+    score[:30] = 0.1  # the backdrop above a table
+    score[15:40, 30:50] = 0.8  # an object in front of both
+    score[22:30, 36:44] = 0.1  # a plain patch of it
+    score[24, 28:36] = 0.2  # a gap in its outline
+    backdrop = stereo._backdrop(score)
+    assert backdrop[:15].all() and backdrop[:30, :28].all()
+    assert not backdrop[30:].any() and not backdrop[20:, 34:46].any()
+
+
+def test_depth_on_the_plane_is_that_of_a_plain_table(block):
+    views, truth, _ = block
+    table = stereo._on_plane(truth[0], views, 0, Plane(torch.tensor([0.0, 0, 1]), 0.0))
+    _, points = stereo.unproject(truth[0], views.cameras.Ks[0], views.cameras.viewmats[0])
+    assert table[points[..., 2] < 0.01].all() and not table[points[..., 2] > 0.1].any()
+    assert not stereo._on_plane(truth[0], views, 0, None).any()

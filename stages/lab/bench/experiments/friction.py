@@ -102,7 +102,7 @@ def grooves() -> Iterator[Experiment]:
     run = Run(tuple(Specimen(body, loss=0.02) for body in bodies),
               {"pin": ("1",), "friction": 0.8, "velocity": ("object=2 0,.4,0",), "steps": 31})  # fmt: skip
     yield Experiment("roll/groove", (run,), lambda t: float(t.com[-1, 1, 1] - t.com[-11, 1, 1]) / (0.2 * 0.4), 1 / 1.8,
-                     "speed, 1 before", 1.0, TOLERANCES)  # fmt: skip
+                     "speed, 1 before", 1 / 1.8, TOLERANCES)  # fmt: skip
 
 
 def rocking() -> Iterator[Experiment]:

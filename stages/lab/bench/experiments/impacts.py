@@ -57,8 +57,8 @@ def tumbling() -> Iterator[Experiment]:
         k = int((middle[1:] < 0).nonzero()[0])
         return t.info.dt * (k + float(middle[k] / (middle[k] - middle[k + 1])))
 
-    yield Experiment("free space/flip", (run,), flip, push / 2 + flip_time(moments, turn), "time [s]", 1.0,
-                     TOLERANCES)  # fmt: skip
+    value = push / 2 + flip_time(moments, turn)
+    yield Experiment("free space/flip", (run,), flip, value, "time [s]", value, TOLERANCES)
 
 
 def flip_time(moments: Tensor, momentum: Tensor) -> float:

@@ -36,11 +36,11 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def ngff(
-    verbose: Annotated[bool, Option("-v", "--verbose", help="log more detail")] = False,
+    verbose: Annotated[bool, Option("-v", "--verbose", help="also log debug messages")] = False,
     version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="print the version")] = False,
     threads: Threads = None,
 ) -> None:
-    """From a folder of photos to a video of a physics simulation of the scene.
+    """Reconstruct a scene from photos, simulate the physics of its objects and render the motion as a video.
 
     ngff reconstruct photos/ -o scene.ply; ngff simulate scene.ply -o traj.h5; ngff render traj.h5
     """
@@ -54,7 +54,7 @@ def reconstruct(
     imgs: Annotated[
         Path,
         Argument(
-            metavar="PHOTOS", help="folder of photos, or a video; with --sequence a folder of films", show_default=False
+            metavar="PHOTOS", help="folder of photos, or a video; with --sequence: folder of films", show_default=False
         ),
     ],
     out: Annotated[Path, Option("-o", "--out", help="scene to write (.ply)")] = Path("scene.ply"),
@@ -111,14 +111,16 @@ def render(
     *,
     source: Annotated[
         list[Path],
-        Argument(metavar="TRAJ.h5|SCENE.ply", help="file to render; several with --side-by-side", show_default=False),
+        Argument(
+            metavar="TRAJ.h5|SCENE.ply", help="file to render; give several with --side-by-side", show_default=False
+        ),
     ],
     out: Annotated[
         Path | None,
         Option(
             "-o",
             "--out",
-            help=f"file to write ({' '.join(OUTPUT_FORMATS)}); default: named after the input and the view",
+            help=f"file to write ({' '.join(OUTPUT_FORMATS)}); default: a name made of the input and the view",
         ),
     ] = None,
     options: RenderOptions,
@@ -135,7 +137,7 @@ def evaluate(
         list[Path],
         Argument(
             metavar="PREDICTION",
-            help=".h5, .ply, .mp4 or a folder of PNGs; with --judge one film or several, or folders of films",
+            help=".h5, .ply, .mp4 or a folder of PNGs to evaluate; with --judge: one or more films or folders of films",
             show_default=False,
         ),
     ],
@@ -143,8 +145,8 @@ def evaluate(
         Path | None,
         Option(
             "--against",
-            help="ground truth, of the same kind; for a .ply also a folder of label "
-            "images named as its photos, with names.json",
+            help="ground truth, of the same kind as PREDICTION; for a .ply also a folder of label "
+            "images named like the photos of the scene, with a names.json",
             show_default=False,
         ),
     ] = None,
@@ -156,7 +158,7 @@ def evaluate(
 ) -> None:
     """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json.
 
-    With --judge and without a truth: films -> PhysR and PhotoR, as rated by a vision-language model.
+    With --judge instead of --against, a vision-language model scores films: the metrics PhysR and PhotoR.
     """
     load("stages.evaluate.stage:run")(prediction, against, out, options, as_json=as_json)
 

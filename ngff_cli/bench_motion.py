@@ -26,7 +26,7 @@ add_benchmark(
     "physics",
     "stages.lab.bench.physics:run",
     PhysicsBenchOptions,
-    "Textbook experiments (slides, slopes, towers, rebounds, ...): each engine compared with the analytic value.",
+    "Textbook experiments (slides, slopes, towers, rebounds, ...): each engine compared with analytic values.",
     OutWithTable,
     Path("physics.json"),
 )
@@ -36,18 +36,21 @@ add_benchmark(
 @with_options
 def bench_dynamics(
     *,
-    data: Annotated[Path | None, Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
+    data: Annotated[Path | None, Option(help="folder of motions, written by `ngff-lab dataset`")] = None,
     weights: Annotated[
-        Path | None, Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
+        Path | None, Option(help="folder of weights to evaluate (.safetensors); default: the weights in the package")
     ] = None,
     out: Annotated[
         Path, Option("-o", "--out", help="results (.json); existing results are kept; also writes a table and plots")
     ] = Path("results.json"),
     nudged: Annotated[
-        Path | None, Option(help="data set of the same scenes with initial positions shifted by 1 mm")
+        Path | None,
+        Option(
+            help="data set of the same scenes with initial positions shifted by 1 mm, to measure their predictability"
+        ),
     ] = None,
     results: Annotated[
-        Path | None, Option("--from", help="only draw the table and plots of these results (.json)")
+        Path | None, Option("--from", help="only redraw the table and plots of existing results (.json)")
     ] = None,
     options: DynamicsBenchOptions,
     as_json: AsJson = False,
@@ -57,7 +60,9 @@ def bench_dynamics(
     from stages.lab.bench.dynamics import redraw, run
 
     if results is None and data is None:
-        raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
+        raise InputError(
+            "--data is missing: name the folder of motions to measure on, or redraw existing results with --from"
+        )
 
     def lines(path: Path) -> Iterable[str]:
         return redraw(path) if results is not None else run(data, weights or SHIPPED, path, options, nudged)
@@ -69,9 +74,9 @@ def bench_dynamics(
 @with_options
 def bench_ablation(
     *,
-    data: Annotated[Path, Option(help="folder of motions, as `ngff-lab dataset` writes")],
+    data: Annotated[Path, Option(help="folder of motions, written by `ngff-lab dataset`")],
     out: OutWithTable = Path("ablation.json"),
-    only: Annotated[str, Option(help="names of the ablations, such as full,reaction; default: all")] = "",
+    only: Annotated[str, Option(help="names of the ablations to run, such as full,reaction; default: all")] = "",
     options: AblationBenchOptions,
     as_json: AsJson = False,
 ) -> None:
@@ -86,7 +91,7 @@ add_benchmark(
     "track",
     "stages.lab.bench.track:run",
     TrackBenchOptions,
-    "Tracking: errors of pose and time, and lost frames, in rendered videos of ten cameras with known motion.",
+    "Tracking: errors of pose and time, and lost frames, in videos of known motion rendered for ten cameras.",
 )
 
 

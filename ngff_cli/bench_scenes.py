@@ -29,12 +29,12 @@ Views = Annotated[int, Option(help="number of cameras per scene")]
 @with_options
 def bench_reconstruct(
     *,
-    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
+    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders that contain images/ and cameras.json")],
     out: OutKept = Path("reconstruct.json"),
     options: ReconstructBenchOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
+    """Reconstruction: camera errors relative to reference cameras, PSNR of held-out photos, time and memory."""
     from stages.lab.bench.reconstruct import run
 
     print_results(lambda path: run(sets, path, options), out, as_json)
@@ -44,7 +44,9 @@ def bench_reconstruct(
 @with_options
 def bench_appearance(
     *,
-    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
+    sets: Annotated[
+        list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or folders that contain images/")
+    ],
     out: OutKept = Path("appearance.json"),
     options: AppearanceBenchOptions,
     as_json: AsJson = False,
@@ -64,7 +66,7 @@ def bench_segment(
         Argument(
             metavar="PHOTOSET...",
             show_default=False,
-            help="folders of photos, or with images/, that have label images; default: synthetic scenes",
+            help="folders of photos (or of images/) that have label images; default: synthetic scenes",
         ),
     ] = None,
     options: SegmentBenchOptions,
@@ -72,13 +74,15 @@ def bench_segment(
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
+    """Segmentation by geometry, by true and corrupted masks, and by networks: IoU with the true labels.
 
-    With photo sets: objects in real photos compared with label images, by recall, IoU and panoptic quality.
+    With photo sets, compare the objects found in real photos with label images: recall, IoU and panoptic quality.
     """
     if not sets:
         if chosen.labels or chosen.labelled:
-            raise InputError("--labels and --labelled: only apply to real photos; name their folders (PHOTOSET)")
+            raise InputError(
+                "--labels and --labelled: only apply to photo sets; name their folders (PHOTOSET), or drop them"
+            )
         from stages.lab.bench.segment import run
 
         print_results(lambda path: run(path, options), out, as_json)
@@ -94,16 +98,19 @@ def bench_segment_ablation(
     *,
     train: Annotated[
         list[Path],
-        Argument(metavar="FOLDER...", help="scenes to train on, of `clutter --reconstruct --exact`"),
+        Argument(
+            metavar="FOLDER...",
+            help="folder of scenes to train on, written by `ngff-lab clutter --reconstruct --exact`",
+        ),
     ],
-    scores: Annotated[list[Path], Option(help="other scenes, for the scores of candidates; repeatable")],
-    judge: Annotated[list[Path], Option(help="reconstructed scenes to judge on; repeatable")],
+    scores: Annotated[list[Path], Option(help="folder of other scenes, to train the scores of candidates; repeatable")],
+    judge: Annotated[list[Path], Option(help="folder of reconstructed scenes to evaluate on; repeatable")],
     out: OutWithTable = Path("segment_ablation.json"),
-    only: Annotated[str, Option(help="names of the ablations, such as full,colour; default: all")] = "",
+    only: Annotated[str, Option(help="names of the ablations to run, such as full,colour; default: all")] = "",
     options: SegmentAblationOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Ablation: retrain the segmentation network without one of its inputs, classes or kinds of data at a time."""
+    """Ablation: retrain the segmentation network, each time without one of its inputs, classes or kinds of data."""
     from stages.lab.bench.segment_ablation import run
 
     data = SegmentAblationData(train, scores, judge)
@@ -115,7 +122,7 @@ add_benchmark(
     "refine",
     "stages.lab.bench.refine:run",
     RefineBenchOptions,
-    "Inpainting of the table under removed objects: error against the true table in novel views.",
+    "Inpainting of the table under removed objects: errors relative to the true table in novel views.",
 )
 
 

@@ -38,7 +38,7 @@ def bench_raster(
     options: RasterBenchOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Rasteriser: on the CPU compared with a per-pixel rasteriser, on a GPU (--device cuda) with gsplat."""
+    """Rasteriser: compared with a per-pixel rasteriser on the CPU, and with gsplat on a GPU (--device cuda)."""
     from stages.core.backends import pick_device
     from stages.lab.bench import raster
 
@@ -74,23 +74,23 @@ add_benchmark(
 def bench_chain(
     *,
     photos: Annotated[
-        Path | None, Argument(metavar="PHOTOS", help="folder of photos or a video; not with --table")
+        Path | None, Argument(metavar="PHOTOS", help="folder of photos, or a video; not allowed with --table")
     ] = None,
     table: Annotated[
         bool,
-        Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
+        Option("--table", help="measure the paper's table, from rendered photos of 3 and of 6 toys, instead of PHOTOS"),
     ] = False,
     rows: ChainTableOptions,
     options: ChainBenchOptions,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """All stages from photos to a video: time, GPU utilisation, and whether repeated runs give equal files."""
+    """All stages from photos to a video: time, GPU utilisation, and whether repeated runs give identical files."""
     from stages.lab.bench.chain import run
     from stages.lab.bench.chain_table import run as run_table
 
     if table != (photos is None):
-        raise InputError("give PHOTOS or --table")
+        raise InputError("give PHOTOS or --table, one of the two")
     if table:
         print_results(lambda path: run_table(path, rows), out, as_json)
         return

@@ -14,7 +14,7 @@ from stages.lab.dataset.options import DatasetOptions, HeldoutOptions
 
 app = typer.Typer()
 
-Sheet = Annotated[Path | None, Option(help="contact sheet to write (.jpg)")]
+Sheet = Annotated[Path | None, Option(help="contact sheet of the results to write (.jpg)")]
 
 
 def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
@@ -25,7 +25,7 @@ def meshes_option(use: str, kind: str = "mesh") -> OptionInfo:
 
 @app.command()
 def example(
-    out: Annotated[Path, Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder to write photos/, masks/ and the ground truth into")],
     views: Annotated[int, Option(help="number of photos")] = 26,
 ) -> None:
     """Generate the example: rendered photos of toys on a table, with true cameras, labels and motion."""
@@ -38,14 +38,14 @@ def example(
 @with_options
 def dataset(
     *,
-    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set to write; existing files are kept")],
     options: DatasetOptions,
-    check: Annotated[bool, Option("--check", help="only compare all files with their checksums")] = False,
+    check: Annotated[bool, Option("--check", help="generate nothing; verify the checksums of all files")] = False,
     ray: Annotated[
         str,
         Option(
-            help="Ray cluster: local, auto or an address. All machines need the same ngff and "
-            "FOLDER at the same path; each makes one group at a time"
+            help="Ray cluster to use: local, auto or an address. All machines need the same ngff and "
+            "FOLDER at the same path; each machine generates one group at a time"
         ),
     ] = "",
 ) -> None:
@@ -62,10 +62,14 @@ def dataset(
 
 @app.command("import")
 def import_(
-    folder: Annotated[Path, Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
+    folder: Annotated[
+        Path,
+        Argument(metavar="FOLDER", help="folder mpm/<group>/<scene> of GSCollision, with files 0000.h5, 0001.h5, ..."),
+    ],
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     scene: Annotated[
-        Path | None, Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ next to mpm/")
+        Path | None,
+        Option(help="point_cloud.ply of the scene; default: the one in scenes/<group>/<scene>/ next to mpm/"),
     ] = None,
     keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 2048,
 ) -> None:
@@ -77,19 +81,22 @@ def import_(
 
 @app.command()
 def statistics(
-    data: Annotated[Path, Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
+    data: Annotated[Path, Argument(metavar="FOLDER", help="data set, written by `ngff-lab dataset`")],
     out: Out = None,
     groups: Annotated[str, Option(help="groups of scenes, such as 3_0..3_9,4")] = DatasetOptions.groups,
     keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 512,
     against: Annotated[
-        Path | None, Option(help="the same scenes made with --nudge: report the predictability instead")
+        Path | None,
+        Option(
+            help="the same scenes generated with --nudge; report the predictability of the motion instead of statistics"
+        ),
     ] = None,
     sheet: Sheet = None,
-    scenes: Annotated[int, Option(help="rows of the contact sheet, one scene each")] = 10,
+    scenes: Annotated[int, Option(help="rows of the contact sheet, one per scene")] = 10,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Statistics of a data set: falls, contacts, tipping and rest of the objects; or its predictability."""
+    """Statistics of a data set: how often objects fall, touch, tip over and come to rest; or its predictability."""
     from stages.lab.dataset import scene_statistics, sensitivity
     from stages.lab.dataset.selection import parse_groups
 
@@ -112,7 +119,7 @@ def study(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Resolution study: motion simulated at several resolutions compared with the published one."""
+    """Resolution study: compare motion simulated at several resolutions with motion at the published resolution."""
     from stages.lab.dataset.resolution_study import run
 
     print_results(lambda path: run(path, scenes, device), out, as_json)
@@ -122,7 +129,7 @@ def study(
 @with_options
 def objects(
     *,
-    out: Annotated[Path, Argument(metavar="FOLDER", help="output folder, with one folder per object")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder to write into, with one folder per object")],
     options: ObjectsOptions,
     meshes: Annotated[list[Path], meshes_option("to convert instead", "textured mesh")] = [],  # noqa: B006
     sheet: Sheet = None,
@@ -136,11 +143,13 @@ def objects(
 
 @app.command()
 def backgrounds(
-    out: Annotated[Path, Argument(metavar="FOLDER", help="output folder, with one folder per background")],
-    only: Annotated[str, Option(help="names of the backgrounds, such as table0,table3; default: all eight")] = "",
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder to write into, with one folder per background")],
+    only: Annotated[
+        str, Option(help="names of the backgrounds to write, such as table0,table3; default: all eight")
+    ] = "",
     sheet: Sheet = None,
 ) -> None:
-    """Generate the eight tables of the data set with their surroundings as Gaussians."""
+    """Generate the eight backgrounds of the data set, tables with their surroundings, as Gaussians."""
     from stages.lab.assets.backgrounds import run
 
     for line in run(out, only, sheet):
@@ -151,11 +160,11 @@ def backgrounds(
 @with_options
 def heldout(
     *,
-    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set to write; existing files are kept")],
     meshes: Annotated[list[Path], meshes_option("that replaces the eight shapes")] = [],  # noqa: B006
     options: HeldoutOptions,
 ) -> None:
-    """Simulate scenes of objects other than the ten; by default of eight that are never used in training."""
+    """Simulate scenes of objects other than the data set's ten; by default eight objects never used in training."""
     from stages.lab.dataset.heldout import run
 
     print(run(out, options, meshes))
@@ -165,7 +174,7 @@ def heldout(
 @with_options
 def clutter(
     *,
-    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes to write; finished scenes are kept")],
     meshes: Annotated[list[Path], meshes_option("added to the generated objects", "textured mesh")] = [],  # noqa: B006
     options: ClutterOptions,
 ) -> None:

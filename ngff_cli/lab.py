@@ -24,7 +24,9 @@ from stages.lab.track.options import TrackOptions
 
 app = new_app()
 
-MaterialsOut = Annotated[Path, Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")]
+MaterialsOut = Annotated[
+    Path, Option("-o", "--out", help="file of materials to write (.json), for `ngff simulate --materials`")
+]
 
 
 @app.callback()
@@ -45,11 +47,13 @@ def doctor(as_json: AsJson = False) -> None:
 @with_options
 def replay(
     *,
-    recording: Annotated[Path, Argument(metavar="RECORDING.npz", help="run of the published MPM solver")],
-    out: Annotated[Path, Option("-o", "--out", help="our run to write, as RECORDING")] = Path("ours.npz"),
+    recording: Annotated[Path, Argument(metavar="RECORDING.npz", help="recorded run of the published MPM solver")],
+    out: Annotated[Path, Option("-o", "--out", help="file for our run to write, in the format of RECORDING")] = Path(
+        "ours.npz"
+    ),
     options: ReplayOptions,
 ) -> None:
-    """Repeat a recorded run of the published MPM solver with ours and print the differences."""
+    """Repeat a recorded run of the published MPM solver with our solver and print the differences."""
     from stages.lab.bench.replay import run
 
     for line in run(recording, out, options):
@@ -59,9 +63,11 @@ def replay(
 @app.command()
 def fuzz(
     out: Annotated[Path, Option("-o", "--out", help="report to write (.json)")] = Path("fuzz.json"),
-    count: Annotated[int, Option(help="number of damaged files")] = 10_000,
+    count: Annotated[int, Option(help="number of damaged files to read")] = 10_000,
     seed: Annotated[int, Option(help="random seed of the damage")] = 0,
-    minutes: Annotated[float, Option(help="stop after this time, and report on the files so far [min]")] = math.inf,
+    minutes: Annotated[
+        float, Option(help="stop after this time and report on the files read until then [min]")
+    ] = math.inf,
     as_json: AsJson = False,
 ) -> None:
     """Fuzz the readers: read randomly damaged files of every format, and keep those that raise unexpected errors."""
@@ -97,8 +103,8 @@ def fit(
         list[Path],
         Argument(
             metavar="TRACK.h5|FILM.mp4",
-            help="trajectory of the scene's objects, or films of its cameras, each named as its camera; "
-            "the first frame is the scene",
+            help="trajectory of the scene's objects, or films of the scene's cameras, each named like its camera; "
+            "the first frame must show the state of the scene",
         ),
     ],
     out: MaterialsOut = Path("materials.json"),
@@ -122,7 +128,9 @@ def fit(
 def track(
     *,
     scene: SceneIn,
-    films: Annotated[Path, Argument(metavar="CAMERAS/", help="folder of the films that the scene was made from")],
+    films: Annotated[
+        Path, Argument(metavar="CAMERAS/", help="folder of the films from which the scene was reconstructed")
+    ],
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("truth.h5"),
     options: TrackOptions,
 ) -> None:
@@ -145,8 +153,8 @@ def questionnaire(
         Path,
         Argument(
             metavar="FOLDER",
-            help="folder of films, one folder for each model, in it "
-            "one for each split if there are several; with --answers: a study",
+            help="folder of films with one folder per model, divided into "
+            "one folder per split if there are several; with --answers: folder of a study",
         ),
     ],
     out: Annotated[
@@ -154,15 +162,15 @@ def questionnaire(
         Option(
             "-o",
             "--out",
-            help="folder of the study to write, default: study; with --answers: JSON file to write the table to",
+            help="folder of the study to write, by default study; with --answers: JSON file to write the table to",
         ),
     ] = None,
     answers: Annotated[
-        list[Path], Option(help="file that a participant returned, or a folder of them; repeatable")
+        list[Path], Option(help="file of answers returned by a participant, or folder of such files; repeatable")
     ] = [],  # noqa: B006
     options: StudyOptions,
 ) -> None:
-    """Write the pages of a user study on which people rate videos, or with --answers the table of their ratings."""
+    """Write the pages of a user study in which people rate videos, or with --answers the table of their ratings."""
     from stages.lab.questionnaire import answers as table
     from stages.lab.questionnaire import study
 

@@ -22,10 +22,10 @@ from stages.core.backends import load
 from stages.core.errors import InputError
 
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
-Device = Annotated[str, typer.Option(help="auto | cpu | cuda | cuda:N")]
+Device = Annotated[str, typer.Option(help="device to compute on: auto | cpu | cuda | cuda:N")]
 Threads = Annotated[int | None, typer.Option(
-    help="number of CPU threads; default: all cores. With the environment variable OMP_WAIT_POLICY=ACTIVE waiting "
-         "threads spin: faster on an idle machine, slower on a busy one", show_default=False)]  # fmt: skip
+    help="number of CPU threads; default: all cores. If the environment variable OMP_WAIT_POLICY is ACTIVE, waiting "
+         "threads spin, which is faster on an idle machine and slower on a busy one", show_default=False)]  # fmt: skip
 
 Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
 OutKept = Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing results are kept")]

@@ -11,21 +11,27 @@ from stages.lab.training.options import SegmenterTraining, SplatterOptions, Trai
 
 app = typer.Typer()
 
-Half = Annotated[bool, Option("--half", help="also store the weights in 16 bits, for the package")]
+Half = Annotated[
+    bool, Option("--half", help="also write the weights in 16-bit precision, for inclusion in the package")
+]
 
 
 @app.command()
 @with_options
 def train(
     *,
-    model: Annotated[str, Argument(metavar="MODEL", help="ngff | ngff-paper | gcn | transformer | ...")],
-    data: Annotated[Path, Option(help="folder of motions, as `ngff-lab dataset` writes")],
+    model: Annotated[
+        str, Argument(metavar="MODEL", help="model to train: ngff | ngff-paper | gcn | transformer | ...")
+    ],
+    data: Annotated[Path, Option(help="folder of motions, written by `ngff-lab dataset`")],
     out: Annotated[Path, Option("-o", "--out", help="weights to write (.safetensors)")],
     options: TrainOptions,
     start: Annotated[Path | None, Option("--from", help="initial weights (.safetensors); default: random")] = None,
-    resume: Annotated[bool, Option("--resume", help="continue from the .ckpt next to the weights")] = False,
+    resume: Annotated[
+        bool, Option("--resume", help="continue an interrupted training from the .ckpt file next to --out")
+    ] = False,
 ) -> None:
-    """Train a dynamics model on simulated motion."""
+    """Train a dynamics model on simulated motions."""
     from stages.lab.training.train import run
 
     for line in run(model, data, out, options, resume, start):
@@ -34,7 +40,10 @@ def train(
 
 @app.command()
 def card(
-    cards: Annotated[list[Path], Argument(metavar="CARD.json", help="training cards; several are compared")],
+    cards: Annotated[
+        list[Path],
+        Argument(metavar="CARD.json", help="training cards (.json next to weights); several are drawn in one plot"),
+    ],
     out: Annotated[Path, Option("-o", "--out", help="plot to write (.png)")] = Path("training.png"),
     half: Half = False,
 ) -> None:
@@ -47,9 +56,11 @@ def card(
 
 @app.command()
 def average(
-    files: Annotated[list[Path], Argument(metavar="WEIGHTS", help="two or more, of one model (.safetensors)")],
+    files: Annotated[
+        list[Path], Argument(metavar="WEIGHTS", help="two or more files of weights of one model (.safetensors)")
+    ],
     out: Annotated[Path, Option("-o", "--out", help="weights to write (.safetensors)")],
-    ratios: Annotated[str, Option(help="weight of each file, such as 0.7,0.3")],
+    ratios: Annotated[str, Option(help="weight of each file in the average, such as 0.7,0.3")],
     half: Half = False,
 ) -> None:
     """Average the weights of several training runs."""
@@ -66,11 +77,14 @@ def train_splatter(
         Path,
         Argument(
             metavar="FOLDER",
-            help="scenes (.ply), and folders of photos with their cameras (transforms.json or a COLMAP model)",
+            help="folder of scenes (.ply) and of photo folders with cameras (transforms.json or a COLMAP model)",
         ),
     ],
     out: Annotated[Path, Option("-o", "--out", help="weights of pi3-splat to write (.safetensors)")],
-    weights: Annotated[Path | None, Option(help="initial weights of pi3 or pi3-splat; default: searched")] = None,
+    weights: Annotated[
+        Path | None,
+        Option(help="initial weights of pi3 or pi3-splat; default: searched in $NGFF_WEIGHTS and ~/.cache/ngff"),
+    ] = None,
     options: SplatterOptions,
 ) -> None:
     """Train the Gaussian head of pi3-splat; the rest of the network stays fixed."""
@@ -84,11 +98,15 @@ def train_splatter(
 @with_options
 def train_segmenter(
     *,
-    data: Annotated[list[Path], Argument(metavar="FOLDER", help="scenes of `ngff-lab clutter`; several folders")],
+    data: Annotated[
+        list[Path],
+        Argument(metavar="FOLDER", help="folder of scenes written by `ngff-lab clutter`; several may be given"),
+    ],
     out: Annotated[Path, Option("-o", "--out", help="weights to write (.safetensors)")],
     options: SegmenterTraining,
     scores_from: Annotated[
-        list[Path], Option(help="scenes whose candidates train the scores; repeatable; default: those of FOLDER")
+        list[Path],
+        Option(help="folder of scenes whose candidates train the scores; repeatable; default: the scenes of FOLDER"),
     ] = [],  # noqa: B006
     start: Annotated[Path | None, Option("--from", help="initial weights (.safetensors); default: random")] = None,
 ) -> None:

@@ -30,22 +30,22 @@ def option(default: Any, help: str, *flags: str, **limits: Any) -> Any:
 
 def seed_option() -> Any:
     """The field `seed`."""
-    return option(0, "random seed; the same seed and device give the same result", min=0, max=MAX_SEED)
+    return option(0, "random seed; the same seed on the same device gives the same result", min=0, max=MAX_SEED)
 
 
 def device_option() -> Any:
     """The field `device`."""
-    return option("auto", "auto | cpu | cuda | cuda:N")
+    return option("auto", "device to compute on: auto | cpu | cuda | cuda:N")
 
 
 def photos_option(backends: str) -> Any:
     """The field `photos` of a stage in which these backends read photos."""
-    return option(None, f"for {backends}: folder of the scene's photos; default: rendered images")
+    return option(None, f"for {backends}: folder of the scene's photos; default: use rendered images of the scene")
 
 
 def download_option(backends: str) -> Any:
     """The field `download` of a stage in which these backends have published weights."""
-    return option(False, f"for {backends}: download missing weights, after logging size and licence")
+    return option(False, f"for {backends}: download missing weights; their size and licence are logged first")
 
 
 def check_types(options: Any) -> None:

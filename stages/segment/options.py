@@ -116,6 +116,6 @@ class SegmentOptions:
             if not sign or not re.fullmatch(r"0*[1-9][0-9]{0,4}", number.strip()) or not name.strip():
                 raise InputError(f'--names: {part[:80]!r} is not NUMBER=NAME; write "1=duck,2=bowl"')
             if int(number) in names:
-                raise InputError(f"--names: object {int(number)} is there twice; give it one name")
+                raise InputError(f"--names: object {int(number)} occurs twice; give it one name")
             names[int(number)] = name.strip()
         return names

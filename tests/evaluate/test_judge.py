@@ -156,7 +156,7 @@ def test_wrong_films_and_options_send_nothing(chat_server, films, tmp_path):
     write_png(tmp_path / "x.png", torch.zeros(16, 16, 3))
     with VideoWriter(tmp_path / "one.mp4", 20.0) as out:
         out.append(torch.zeros(32, 32, 3))
-    for given, says in ((tmp_path / "empty", "has no films"), (tmp_path / "x.mp4", "not a video"),
+    for given, says in ((tmp_path / "empty", "has no films"), (tmp_path / "x.mp4", "not a video that can be read"),
                         (tmp_path / "x.png", "is not a film"), (tmp_path / "one.mp4", "one frame only"),
                         (film.parent, "is given twice"), (tmp_path / "no.mp4", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=says):

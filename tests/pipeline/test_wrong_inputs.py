@@ -172,7 +172,7 @@ def test_outputs_of_the_lab_have_the_suffix_of_their_format(input_files, line):
 @pytest.mark.parametrize("line", ["clutter good.ply", "objects good.ply", "backgrounds good.ply", "dataset good.ply",
                                   "heldout good.ply"])  # fmt: skip
 def test_folders_of_the_lab_that_are_files_are_reported_before_the_work(line):
-    assert re.search("good.ply.*: is no folder", fails_cleanly(line, lambda *words: call(*words, app=lab_app)))
+    assert re.search("good.ply.*: is not a folder", fails_cleanly(line, lambda *words: call(*words, app=lab_app)))
 
 
 def test_a_file_is_not_rendered_over_itself(input_files):
@@ -184,7 +184,7 @@ def test_a_file_is_not_rendered_over_itself(input_files):
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="permissions are those of POSIX")
 def test_a_folder_that_cannot_be_written_to_is_reported_before_the_work(input_files, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write everywhere
-    assert "o.ply: its folder cannot be written to" in fails_cleanly("segment good.ply -o o.ply")
+    assert "o.ply: its folder is not writable" in fails_cleanly("segment good.ply -o o.ply")
 
 
 FULL = [

@@ -158,7 +158,7 @@ def test_error_suggests_a_subfolder_or_video(tmp_path):
     with pytest.raises(InputError, match="films: holds no photos itself; give .*IMG 7.MOV"):
         read_photos(tmp_path / "films")
     (tmp_path / "none").mkdir()
-    with pytest.raises(InputError, match="none: no photos in it; these formats are read"):
+    with pytest.raises(InputError, match="none: contains no photos; supported formats"):
         read_photos(tmp_path / "none")
 
 

@@ -66,7 +66,7 @@ def test_object_of_the_background_colour_is_reported_as_missing(tmp_path, caplog
     """A block with the colour of the table."""
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
-    assert found.objects == () and "won no Gaussian" in caplog.text
+    assert found.objects == () and "no Gaussian was assigned" in caplog.text
 
 
 def test_views_are_ordered_by_distance_and_limited():
@@ -160,7 +160,7 @@ def test_box_coordinates_are_scaled_from_their_image_size(tmp_path):
     with pytest.raises(InputError, match="is not a prompts file"):
         read_prompts(tmp_path / "p.json", cameras)
     (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "size": [1600, 1600]}')
-    with pytest.raises(InputError, match="p.json: size of 00.jpg is 1600x1600, in the scene 160x80"):
+    with pytest.raises(InputError, match="p.json: size of 00.jpg is 1600x1600 pixels, but 160x80 in the scene"):
         read_prompts(tmp_path / "p.json", cameras)
 
 

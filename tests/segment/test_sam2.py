@@ -114,7 +114,9 @@ def test_weights_are_downloaded_only_on_request_and_if_missing(weights, tmp_path
 def test_photos_of_another_aspect_ratio_are_refused(scene_file, truth, weights, photos, tmp_path):
     write_png(photos / "05.png", render_view(truth, 5)[:80])
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
-    with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*rendered instead"):
+    with pytest.raises(
+        InputError, match="--photos: 05.jpg is 160x80 pixels, but 160x160 in the scene.*rendered instead"
+    ):
         options = SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights)
         run(scene_file, tmp_path / "out.ply", options)
 

@@ -235,7 +235,7 @@ def test_masks_of_another_aspect_ratio_are_refused(scene_file, truth, tmp_path):
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [({"names": "duck"}, "NUMBER=NAME"), ({"names": "1=duck,01=bowl"}, "object 1 is there twice"),
+    [({"names": "duck"}, "NUMBER=NAME"), ({"names": "1=duck,01=bowl"}, "object 1 occurs twice"),
      ({"scale_reference": "duck=0.1"}, "object=1 height=0.12"),
      ({"scale_reference": "object=1 height=0"}, "more than 0"), ({"max_objects": 0}, "max-objects"),
      ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them"),

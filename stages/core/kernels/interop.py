@@ -22,8 +22,9 @@ def _ready() -> None:
     try:
         _initialise()
     except OSError as error:
-        log.warning("%s: cannot be created (%s), so that each run compiles its kernels; set $WARP_CACHE_PATH to a "
-                    "folder that can be written to", error.filename, error.strerror)  # fmt: skip
+        log.warning("%s: the cache of compiled kernels cannot be created (%s), so that each run compiles its "
+                    "kernels; set $WARP_CACHE_PATH to a "
+                    "writable folder", error.filename, error.strerror)  # fmt: skip
         _folders.append(TemporaryDirectory(prefix="ngff-kernels-"))
         wp.config.kernel_cache_dir = _folders[-1].name
         _initialise()

@@ -61,16 +61,21 @@ class ChatEndpoint:
         model = model or os.environ.get("OPENAI_MODEL", "").strip()
         key = os.environ.get("OPENAI_API_KEY", "").strip()
         if not _is_address(url):
-            raise InputError(f"OPENAI_BASE_URL={url}: must begin with http:// or https://, such as {URL}, and hold no "
+            raise InputError(f"OPENAI_BASE_URL={url}: must begin with http:// or https://, such as {URL}, and "
+                             "contain no "
                              "password")  # fmt: skip
         if not model:
-            raise InputError(f"which model of {url}? name one that accepts images with --model or OPENAI_MODEL")
+            raise InputError(
+                f"--model: no model of {url} is named; name one that accepts images with --model or OPENAI_MODEL"
+            )
         if not key and url == URL:
             raise InputError(f"{url} needs a key: set OPENAI_API_KEY, or OPENAI_BASE_URL for a server without keys")
         if not (key.isascii() and key.isprintable()):
-            raise InputError("OPENAI_API_KEY: has characters that no key has, such as a line break; copy it again")
+            raise InputError(
+                "OPENAI_API_KEY: has characters that are not allowed in a key, such as a line break; copy the key again"
+            )
         if not 0 < timeout <= MAX_TIMEOUT:
-            raise InputError(f"--timeout {timeout:g}: give seconds above 0, at most {MAX_TIMEOUT}")
+            raise InputError(f"--timeout {timeout:g}: give a time above 0 s and at most {MAX_TIMEOUT} s")
         return ChatEndpoint(url, model, key, timeout)
 
     def ask(self, messages: list[dict]) -> str:
@@ -78,7 +83,7 @@ class ChatEndpoint:
         problem, pause = "", PAUSE
         for attempt in range(ATTEMPTS):
             if attempt:
-                log.info("%s: %s; asking again in %.1f s", self.url, problem, pause)
+                log.info("%s: %s; sending the request again in %.1f s", self.url, problem, pause)
                 time.sleep(pause)
             pause = PAUSE * 2**attempt
             try:
@@ -92,7 +97,9 @@ class ChatEndpoint:
                 problem = str(error)
             except (OSError, HTTPException) as error:  # URLError and TimeoutError are OSErrors
                 problem = self._silence(error)
-        raise InputError(f"{self.url}: {problem}, {ATTEMPTS} times; try later, or another OPENAI_BASE_URL")
+        raise InputError(
+            f"{self.url}: {problem}, in each of {ATTEMPTS} attempts; try again later, or use another OPENAI_BASE_URL"
+        )
 
     def ask_until_valid(self, messages: list[dict], parse: Callable[[str], T], tries: int) -> tuple[T, list[str]]:
         """Ask until `parse` accepts a reply; return its result, and all replies.
@@ -215,7 +222,7 @@ def json_object(reply: str) -> dict:
 def _once(pairs: list[tuple[str, object]]) -> dict:
     keys = [key for key, _ in pairs]
     if len(set(keys)) < len(keys):
-        raise InvalidReply("a name is there twice")
+        raise InvalidReply("a name occurs twice")
     return dict(pairs)
 
 

@@ -57,8 +57,9 @@ def find(name: str, given: Path | None = None) -> Path:
         if (folder / f"{name}.safetensors").is_file():
             return folder / f"{name}.safetensors"
     looked = " or ".join(str(folder) for folder in folders)
-    raise InputError(f"{name}: no weights {name}.safetensors in {looked}; train them with `ngff-lab train {name}`, "
-                     "or name a file with --weights")  # fmt: skip
+    raise InputError(f"{name}: no weights {name}.safetensors in {looked}; train them with `ngff-lab "
+                     f"train {name}`, "
+                     "or name their file with --weights")  # fmt: skip
 
 
 def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, half: bool = False) -> None:
@@ -132,11 +133,12 @@ def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
     """Read the tensors of a .safetensors file in 32 bits; InputError if it is damaged or does not match its card."""
     if sha256(path) != card["sha256"]:
         raise InputError(f"{path}: does not have the sha256 that {path.with_suffix('.json').name} states; the file is "
-                         "damaged or of another training; fetch or train both again")  # fmt: skip
+                         "damaged or comes from a different training run; download or train both files "
+                         "again")  # fmt: skip
     try:
         state = dense_tensors(path, load_file(path))
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(f"{path}: is not a safetensors file ({reason(error)}); fetch or train it again") from error
+        raise InputError(f"{path}: is not a safetensors file ({reason(error)}); download or train it again") from error
     return {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
 
 
@@ -158,9 +160,11 @@ def read_card(path: Path, models: Collection[str]) -> dict:
         wrong = not (isinstance(card["model"], str) and isinstance(card["sha256"], str))
         wrong |= not isinstance(card["config"], dict)
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: is not the card of weights ({reason(error)}); fetch or train it again") from error
+        raise InputError(f"{file}: is not the card of weights ({reason(error)}); download or train it again") from error
     if wrong or card["model"] not in models:
-        raise InputError(f"{file}: needs model (one of {', '.join(models)}), config and sha256")
+        raise InputError(
+            f"{file}: needs model (one of {', '.join(models)}), config and sha256; download or train it again"
+        )
     return card
 
 

@@ -60,7 +60,7 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
         import huggingface_hub as hub
     except ImportError as error:
         raise MissingPackage(
-            "--download: needs the package huggingface_hub (`pip install 'ngff[hub]'`); or fetch the weights from "
+            "--download: needs the package huggingface_hub (`pip install 'ngff[hub]'`); or download the weights from "
             f"https://huggingface.co/{source.repository} yourself and name the file with --weights"
         ) from error
     try:
@@ -77,14 +77,16 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
         paths = [Path(path) for path in fetched]
     except Exception as error:  # no network, no or a gated repository: each release raises its own exception types
         raise InputError(
-            f"--download: {source.repository} could not be fetched ({' '.join(str(error).split())[:120]}); fetch it "
-            f"where there is a network, {place}, or name it with --weights"
+            f"--download: {source.repository} could not be downloaded ({' '.join(str(error).split())[:120]}); "
+            "download it "
+            f"on a machine with internet access, {place}, or name it with --weights"
         ) from error
     for file, path in zip(files, paths, strict=True):
         if _checksum(file) and sha256(path) != _checksum(file):
             path.unlink()
             raise InputError(
-                f"{path}: is incomplete or altered (its sha256 is not the one stated) and was removed; try again"
+                f"{path}: is incomplete or altered (its sha256 is not the stated one) and was removed; run the "
+                "command again"
             )
     return paths
 

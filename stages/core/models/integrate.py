@@ -72,7 +72,9 @@ def solve_ode(
     except AssertionError as error:  # raised by torchdiffeq
         if "underflow" not in str(error):
             raise
-        raise InputError(f"{method}: the step became too small for these forces; use rk4 or step") from error
+        raise InputError(
+            f"--integrator {method}: the step size became too small for these forces; use rk4 or step"
+        ) from error
 
 
 def _subdivided(t: Tensor, substeps: int) -> Tensor:

@@ -51,7 +51,7 @@ def read_parts(
         return {name: read[name](folder / name) for name in names}
     except (OSError, ValueError, RuntimeError, KeyError) as error:
         raise InputError(
-            f"{folder}: cannot be read as {version} ({' '.join(str(error).split())[:160]}); fetch its "
+            f"{folder}: cannot be read as {version} ({' '.join(str(error).split())[:160]}); download its "
             f"{', '.join(names)} from https://huggingface.co/{source.repository} again"
         ) from error
 

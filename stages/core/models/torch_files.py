@@ -24,8 +24,9 @@ def read_checkpoint(path: Path) -> object:
                     raise ValueError("its parts are compressed, which torch.save does not do")
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise any exception
-        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint, as it is damaged or holds other things than "
-                         "tensors; fetch it again") from error  # fmt: skip
+        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint, as it is damaged or contains other "
+                         "objects than "
+                         "tensors; download it again") from error  # fmt: skip
 
 
 def dense_tensors(path: Path, state: Mapping) -> dict[str, Tensor]:
@@ -38,7 +39,7 @@ def dense_tensors(path: Path, state: Mapping) -> dict[str, Tensor]:
     for name, values in found.items():
         dense = values.layout == torch.strided and values.device.type == "cpu" and not values.is_quantized
         if not dense or values.dtype == PACKED or values.nbytes > values.untyped_storage().nbytes():
-            raise InputError(f"{path}: {quote(name)} is not a dense tensor of numbers; fetch it again")
+            raise InputError(f"{path}: {quote(name)} is not a dense tensor of numbers; download it again")
         if values.is_floating_point() and not values.float().isfinite().all():  # float() also handles 8-bit types
-            raise InputError(f"{path}: {quote(name)} has values that are not finite; fetch or train it again")
+            raise InputError(f"{path}: {quote(name)} has values that are not finite; download or train it again")
     return found

@@ -68,7 +68,7 @@ def _grouped(
     index = _candidates(g, view, support)
     index = index[_is_dense(g.means[index], view)]
     if len(index) < MIN_GAUSSIANS_ABOVE:
-        log.info("no Gaussians above the supporting plane: no objects")
+        log.info("there are no Gaussians above the supporting plane, and so no objects")
         return g
     seen = summed_view_directions(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
     voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])

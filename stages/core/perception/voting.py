@@ -131,13 +131,16 @@ def apply_votes(
     """
     numbers = range(votes.shape[1]) if numbers is None else numbers
     if votes.shape[1] == 1:
-        raise InputError(f"{source}: the label images contain no object: every pixel is 0 or ignored")
+        raise InputError(
+            f"{source}: the label images contain no objects, as every pixel is 0 or ignored; give each object a "
+            "number from 1"
+        )
     means = scene.gaussians.means
     ids = remove_outliers(means, majority_labels(scene, pool_votes(means, votes)))
     present = {numbers[i] for i in ids.unique().tolist()}
     objects = tuple(SceneObject(i, names.get(i, f"object_{i}")) for i in numbers[1:] if i in present)
     if missing := [i for i in numbers[1:] if i not in present]:
-        log.warning("%s: labels %s won no Gaussian", source, ", ".join(map(str, missing)))
+        log.warning("%s: no Gaussian was assigned to the labels %s", source, ", ".join(map(str, missing)))
     g = replace(scene.gaussians, object_id=ids)
     grown = grow_objects(g, find_support(scene, seed=seed), _growth_radius(means, ids)) if objects else g
     grown = replace(grown, object_id=torch.tensor(numbers)[grown.object_id])

@@ -40,7 +40,7 @@ class Collider:
     def __post_init__(self):
         for what, value, table in (("kind", self.kind, KINDS), ("surface", self.surface, SURFACES)):
             if value not in table:
-                raise InputError(f"a collider's {what} is one of {', '.join(table)}, not {value!r}")
+                raise InputError(f"a collider's {what} must be one of {', '.join(table)}, not {value!r}")
         if min(self.size[: {"plane": 0, "sphere": 1, "box": 3}[self.kind]], default=1) <= 0:
             raise InputError(f"a collider that is a {self.kind} needs a positive size")
         if self.friction < 0 or not 0 <= self.restitution <= 1:

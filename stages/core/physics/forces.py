@@ -137,7 +137,7 @@ def _force(text: str, objects: Sequence[SceneObject]) -> Force:
 def _checked(force: Force, where: str) -> Force:
     if not 0 <= force.start < force.end:
         what = "the end must come after the start" if force.start >= 0 else "the simulation begins at 0 s"
-        raise InputError(f"{where}: acts from {force.start} s to {force.end} s; {what}")
+        raise InputError(f"{where}: the force acts from {force.start} s to {force.end} s; {what}")
     return force
 
 
@@ -146,7 +146,7 @@ def _velocities(texts: Sequence[str], objects: Sequence[SceneObject]) -> dict[in
     for text in texts:
         where, words = f"--velocity {quote(repr(text))}", text.split()
         if len(words) != 2 or not words[0].startswith("object="):
-            raise InputError(f'{where}: write "object=1 0,0,2"')
+            raise InputError(f'{where}: is not OBJECT and VELOCITY; write "object=1 0,0,2"')
         o = find_object(words[0].removeprefix("object="), objects, where)
         check_new(o, given, where)
         given[o.id] = vector(words[1], where)
@@ -179,7 +179,7 @@ def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> 
     if not isinstance(data, list):
         raise InputError(f"{path}: must be {{scene name: [{{obj_id, start, end, force?, torque?}}]}}")
     if len(data) > MAX_ROWS:
-        raise InputError(f"{path}: has {len(data)} entries; at most {MAX_ROWS} are read")
+        raise InputError(f"{path}: has {len(data)} entries; at most {MAX_ROWS} are allowed")
     return [_parse_entry(row, objects, f"{path}: entry {i + 1}") for i, row in enumerate(data)]
 
 
@@ -190,7 +190,9 @@ def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> For
         push, torque = (numbers(row.get(name, [0, 0, 0]), 3, name) for name in ("force", "torque"))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         why = reason(error)
-        raise InputError(f"{where}: {why}; needs obj_id, start, end and force or torque of 3 numbers") from error
+        raise InputError(
+            f"{where}: {why}; an entry needs obj_id, start, end, and force or torque of 3 numbers"
+        ) from error
     if id not in {o.id for o in objects}:
         raise InputError(f"{where}: obj_id {id - 1} (counted from 0) is object {id}, which this scene does not have")
     force = _checked(Force(id, push, torque, start, end), where)
@@ -218,5 +220,5 @@ def number(text: str, where: str) -> float:
     except ValueError as error:
         raise InputError(f"{where}: {quote(repr(text))} is not a number") from error
     if not abs(value) <= LARGEST:
-        raise InputError(f"{where}: {quote(repr(text))} is not finite, or beyond {LARGEST:g}")
+        raise InputError(f"{where}: {quote(repr(text))} is not finite or exceeds {LARGEST:g}; give a smaller number")
     return value

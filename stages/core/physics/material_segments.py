@@ -36,6 +36,7 @@ class Segment:
         means = gaussians.means[gaussians.object_id == o.id]
         inside = self.contains(means)
         if not bool(inside.any()):
-            raise InputError(f"{self.path}: nothing of object {o.id} ({o.name}) is in its {self.name}; give the same "
-                             "scene with the parts as objects")  # fmt: skip
+            raise InputError(f"{self.path}: no part of object {o.id} ({o.name}) is in its object {self.name}; "
+                             "give the same "
+                             "scene, with the parts labelled as objects")  # fmt: skip
         return Segment(self.path, self.name, means, inside)

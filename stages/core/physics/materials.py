@@ -167,7 +167,7 @@ def choose_materials(
     for key, value in (read_json_file(file, MATERIALS_FILE) if file else {}).items():
         o, where = find_object(key, objects, f"{file}"), f"{file}: {quote(key)}"
         if o.id in given:
-            raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one material")
+            raise InputError(f"{where}: object {o.id} ({quote(o.name)}) occurs twice; give it one material")
         several = isinstance(value, dict) and "parts" in value
         given[o.id] = _parts(value, where, Path(file).parent) if several else _material(value, where)
     asked: dict[int, MaterialChoice] = {}
@@ -194,14 +194,14 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
     if len(near) == 1:
         return near[0]
     have = quote(", ".join(f"{o.id} ({o.name})" for o in objects) or "none", 300)
-    problem = f"fits {len(near)} objects" if near else "is not an object of this scene"
-    raise InputError(f"{where}: {quote(repr(text))} {problem}; there are: {have}")
+    problem = f"matches {len(near)} objects" if near else "is not an object of this scene"
+    raise InputError(f"{where}: {quote(repr(text))} {problem}; the scene has: {have}")
 
 
 def check_new(o: SceneObject, given: Collection[int], where: str) -> None:
     """Raise InputError, prefixed with `where`, if the option was already given for this object."""
     if o.id in given:
-        raise InputError(f"{where}: object {o.id} ({quote(o.name)}) is there twice; give it one")
+        raise InputError(f"{where}: object {o.id} ({quote(o.name)}) occurs twice; give the option once for each object")
 
 
 def _by_name(o: SceneObject) -> MaterialChoice:
@@ -240,7 +240,7 @@ def _material(value: object, where: str) -> MaterialChoice:
         problem = f"{reason(error)}; E [Pa], density [kg/m^3] and the rest are numbers, plastic three of them"
         raise InputError(f"{where}: {problem}") from error
     if MODELS[material.model].plastic and material.plastic[0] <= 0:
-        raise InputError(f"{where}: the first of plastic must be positive for {material.model}; the "
+        raise InputError(f"{where}: the first number of plastic must be positive for {material.model}; the "
                          f"parameters are: {MODELS[material.model].parameters}")  # fmt: skip
     if not (1e-3 <= material.E < 1e13 and 1e-3 <= material.density < 1e5 and -0.5 < material.nu < 0.49):
         raise InputError(f"{where}: E must be positive and below 1e13 Pa, density positive and below 1e5 kg/m^3, nu "
@@ -262,10 +262,11 @@ def _parts(value: dict, where: str, folder: Path) -> MaterialChoice:
     for k, row in enumerate(rows, 1):
         at = f"{where}: part {k}"
         if not isinstance(row, dict) or row.keys() - {*REGION, "in", "material", "pinned"} or "material" not in row:
-            raise InputError(f"{at}: give a material, its region by below (a height), box (two corners) or segment (an "
-                             "object in a labelled PLY), and pinned if it is held")  # fmt: skip
+            raise InputError(f"{at}: give a material, its region as below (a height), box (two corners) or segment (an "
+                             "object in a labelled PLY), and pinned if the part is held fixed")  # fmt: skip
         if (k < len(rows)) != bool(row.keys() & set(REGION)):
-            raise InputError(f"{at}: every part but the last needs {' or '.join(REGION)}; the last is what the others "
+            raise InputError(f"{at}: every part but the last needs {' or '.join(REGION)}; the last part is what "
+                             "the other parts "
                              "leave")  # fmt: skip
         choice = _material(row["material"], at)
         try:

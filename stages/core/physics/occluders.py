@@ -74,7 +74,7 @@ def make_occluders(scene: Scene, keypoints: Keypoints, device: str = "cpu") -> O
     try:
         bodies = sample_bodies(scene, PARTICLES, skin=True)
     except InputError as error:
-        log.warning("no shadows: %s", error)
+        log.warning("shadows are not rendered: %s", error)
         return None
     parts = []
     for row, o in enumerate(scene.objects):

@@ -90,8 +90,8 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     volume = h**3 * torch.tensor([ratio for _, ratio, _ in solids])[body]
     extended = frozenset(row for row, solid in enumerate(solids) if solid[2])
     for o in (scene.objects[row] for row in sorted(extended)):
-        log.info("object %d (%s) stood in the photos but would tip over as reconstructed; its unseen part is "
-                 "extended down to the floor (see also `ngff refine`)", o.id, o.name)  # fmt: skip
+        log.info("object %d (%s) stands in the photos but its reconstruction would tip over; its unseen part is "
+                 "extended down to the floor (`ngff refine` completes it)", o.id, o.name)  # fmt: skip
     return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h, extended)
 
 

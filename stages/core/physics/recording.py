@@ -66,7 +66,10 @@ def read_prompts_file(path: Path, scene_name: str, objects: Sequence[SceneObject
     acted_on = {f.object_id for f in prompts.forces} | {c.object_id for c in prompts.changes} - {None}
     missing = (acted_on | prompts.pinned | set(prompts.velocity) | set(prompts.lift)) - {o.id for o in objects}
     if missing:
-        raise InputError(f"{path}: acts on object {min(missing)}, which this scene does not have")
+        raise InputError(
+            f"{path}: acts on object {min(missing)}, which this scene does not have; give the scene that it was "
+            "recorded with"
+        )
     return prompts
 
 
@@ -76,4 +79,6 @@ def _options(path: Path, values: object) -> dict[str, Any]:
             raise ValueError("they are no table")
         return {name: check(values[name], name) for name, check in OPTIONS.items() if values.get(name) is not None}
     except ValueError as error:
-        raise InputError(f"{path}: its options of `ngff simulate` are damaged ({reason(error)})") from error
+        raise InputError(
+            f"{path}: its options of `ngff simulate` are damaged ({reason(error)}); save it from the page again"
+        ) from error

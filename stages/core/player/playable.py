@@ -61,17 +61,18 @@ def _model(t: Trajectory) -> ForceField:
     """The network that made the motion. Raises InputError if the page cannot compute it, or other weights were used."""
     path: Path = t.path
     if t.info.engine != "ngff":
-        raise InputError(f"{path}: was simulated by {t.info.engine}, and a page computes only the learned field; "
-                         "simulate with --engine ngff --contact learned for --playable")  # fmt: skip
+        raise InputError(f"{path}: was simulated by {t.info.engine}, but a page can only compute the learned field; "
+                         "for --playable, simulate with --engine ngff --contact learned")  # fmt: skip
     chosen = {"integrator": "step", "contact": "learned"}
     made_with = {name: t.scene.provenance.get("options", {}).get(name, chosen[name]) for name in chosen}
     if t.field is None or made_with != chosen:
-        raise InputError(f"{path}: does not say what the learned field started from, or was made with another "
+        raise InputError(f"{path}: lacks the initial state of the learned field, or was simulated with another "
                          "--integrator or --contact; simulate again with --engine ngff --contact learned")  # fmt: skip
     model, card = checkpoints.load(checkpoints.find("ngff"))
     if card["sha256"] != t.field.units.weights or not isinstance(model, ForceField):
-        raise InputError(f"{path}: was simulated with other weights than those found; set $NGFF_WEIGHTS to their "
-                         "folder for --playable")  # fmt: skip
+        raise InputError(f"{path}: was simulated with weights other than the ones found; for --playable, set "
+                         "$NGFF_WEIGHTS to their "
+                         "folder")  # fmt: skip
     return model
 
 

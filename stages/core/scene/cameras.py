@@ -176,7 +176,7 @@ def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
         why = reason(error)
         raise InputError(
-            f"{path}: is not a nerfstudio transforms file ({why}); it needs frames with file_path and "
+            f"{path}: is not a nerfstudio transforms file ({why}); such a file needs frames with file_path and "
             "transform_matrix, and fl_x fl_y cx cy w h"
         ) from error
 
@@ -236,10 +236,10 @@ def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
         return _known_cameras(viewmats, Ks, sizes, names), LensDistortion(_float([i.lens[:5] for i in images]))
     except OSError as error:
         inside = min((p.parent for depth in ("*/", "*/*/") for p in path.glob(f"{depth}cameras.*")), default=None)
-        hint = f"; give {inside}" if inside else ""
-        raise InputError(f"{path}: holds no COLMAP model (cameras and images, .bin or .txt){hint}") from error
+        hint = inside or "a folder with cameras and images (.bin or .txt)"
+        raise InputError(f"{path}: contains no COLMAP model; give {hint}") from error
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: the COLMAP model cannot be used: {reason(error)}") from error
+        raise InputError(f"{path}: the COLMAP model cannot be read: {reason(error)}; export it again") from error
 
 
 def _known_cameras(viewmats: Sequence, Ks: Sequence, sizes: Sequence, names: Sequence[str]) -> Cameras:

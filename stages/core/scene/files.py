@@ -31,13 +31,17 @@ def check_output(path: Path, *kinds: str) -> None:
     file, and an existing file of that name might be of another kind.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; name the file to write")
+        raise InputError(f"{path}: is a folder; give the name of the file to write")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is no file, but a device or a pipe, which cannot be replaced; name another")
+        raise InputError(
+            f"{path}: is not a regular file but a device or a pipe, which cannot be replaced; name another file"
+        )
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path}: its folder cannot be written to; change its permissions, or name another")
+        raise InputError(
+            f"{path}: its folder is not writable; change the folder's permissions, or name a file in another folder"
+        )
     if kinds:
         format_of(path, *kinds, writable=True)
 
@@ -47,9 +51,11 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: is no folder and cannot become one ({error.strerror}); name another") from error
+        raise InputError(
+            f"{path}: is not a folder and cannot be created ({error.strerror}); name another folder"
+        ) from error
     if not os.access(path, os.W_OK):
-        raise InputError(f"{path}: cannot be written to; change its permissions, or name another folder")
+        raise InputError(f"{path}: is not writable; change its permissions, or name another folder")
     return path
 
 
@@ -57,7 +63,7 @@ def check_json_output(path: Path) -> None:
     """As `check_output`, for JSON. Raises InputError for another suffix too: it might be a file of another kind."""
     check_output(path)
     if path.suffix.lower() != ".json":
-        raise InputError(f"{path}: the file to write is JSON; use the suffix .json")
+        raise InputError(f"{path}: the output is a JSON file; use the suffix .json")
 
 
 @contextmanager
@@ -122,7 +128,7 @@ def must_exist(path: Path, what: str) -> Path:
     if not path.exists():
         raise InputError(f"{path}: no such file; {what} is expected")
     if not path.is_file():
-        raise InputError(f"{path}: is no file, but a device or a pipe; {what} is expected")
+        raise InputError(f"{path}: is not a regular file but a device or a pipe; {what} is expected")
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: cannot be read; check its permissions")
     if path.stat().st_size == 0:

@@ -43,7 +43,7 @@ def list_photos(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: is not a folder; give a folder of photos or a video file")
     photos = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not photos:
-        raise InputError(f"{folder}: no photos in it; these formats are read: {' '.join(sorted(IMAGE_SUFFIXES))}")
+        raise InputError(f"{folder}: contains no photos; supported formats: {' '.join(sorted(IMAGE_SUFFIXES))}")
     return sorted(photos, key=_numbered_name)
 
 
@@ -91,7 +91,9 @@ def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
         data, factor = png_of_numbers(data)
     pixels = _decode(path, data, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2:
-        raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
+        raise InputError(
+            f"{path}: has {pixels.shape[2]} channels; a label image has one channel, which holds the object numbers"
+        )
     if pixels.dtype.kind != "u":
         raise InputError(f"{path}: has values of type {pixels.dtype}; save the label image with 8 bits, as PNG")
     if 8 * pixels.itemsize > max_bits:
@@ -108,7 +110,9 @@ def image_data(path: Path, what: str = "an image") -> bytes:
     with Path(path).open("rb") as file:
         data = file.read(MAX_IMAGE_BYTES + 1)
     if len(data) > MAX_IMAGE_BYTES:
-        raise InputError(f"{path}: has more than {MAX_IMAGE_BYTES >> 20} MB; images of 4000 pixels or less will do")
+        raise InputError(
+            f"{path}: has more than {MAX_IMAGE_BYTES >> 20} MB; reduce the image, for example to 4000 pixels"
+        )
     return data
 
 
@@ -120,7 +124,7 @@ def _check_header(path: Path, data: bytes) -> None:
         raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG") from error
     if header.width * header.height > MAX_PIXELS or header.stored > len(data):
         raise InputError(f"{path}: is damaged, or far too large ({header.width}x{header.height} pixels in {len(data)} "
-                         "bytes); images of 4000 pixels or less will do")  # fmt: skip
+                         "bytes); reduce the image, for example to 4000 pixels")  # fmt: skip
 
 
 def _decode(path: Path, data: bytes, flags: int) -> np.ndarray:
@@ -249,7 +253,9 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
             for frame in file.decode(video=0):
                 yield torch.from_numpy(_upright(frame, frame.to_ndarray(format="rgb24")).astype(np.float32) / 255)
         except import_av(path).FFmpegError as error:
-            raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
+            raise InputError(
+                f"{path}: the video is truncated or damaged ({error.strerror}); copy it again from its source"
+            ) from error
 
 
 def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
@@ -264,7 +270,7 @@ def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h
             for count, frame in enumerate(file.decode(video=0), 1):  # noqa: B007 -- counted
                 yield reduce_frame(frame, side)
         except import_av(path).FFmpegError as error:
-            log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
+            log.warning("%s: is truncated or damaged (%s); the frames before the damage are used", path, error.strerror)
             return
     if count < stream.frames:  # with threads, the decoder reports no error at the end of a truncated file
         log.warning("%s: is truncated or damaged; %d of its %d frames are used", path, count, stream.frames)
@@ -298,7 +304,7 @@ def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
     if frames != total:  # the container's frame count is wrong
         jpegs, _ = _sample(video, frames, count, longest)
     if not jpegs:
-        raise InputError(f"{video}: holds no frames")
+        raise InputError(f"{video}: contains no frames; give another video")
     return jpegs
 
 
@@ -332,17 +338,18 @@ def open_video(path: Path) -> Any:
         options = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
         file = av.open(str(path), **options)
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise InputError(f"{path}: is not a video that can be read") from error
+        raise InputError(f"{path}: is not a video that can be read; convert it to MP4") from error
     if not file.streams.video:
         file.close()
-        raise InputError(f"{path}: holds no video stream")
+        raise InputError(f"{path}: contains no video stream; give another file")
     codec = file.streams.video[0].codec_context  # None for a codec that the library does not support
     width, height = (codec.width, codec.height) if codec is not None else (0, 0)
     if not width * height:
         file.close()
-        raise InputError(f"{path}: is not a video that can be read")
+        raise InputError(f"{path}: is not a video that can be read; convert it to MP4")
     if width * height > MAX_VIDEO_PIXELS:
         file.close()
-        raise InputError(f"{path}: has frames of {width}x{height} pixels; at most {MAX_VIDEO_PIXELS >> 20} million are "
-                         "read")  # fmt: skip
+        raise InputError(f"{path}: has frames of {width}x{height} pixels, but at most {MAX_VIDEO_PIXELS >> 20} "
+                         "million are "
+                         "supported; reduce their size")  # fmt: skip
     return file

@@ -40,8 +40,8 @@ class Undistortion:
         """
         K, full, lens = photo_of(cameras, view, undistorted)
         if abs(size[0] / size[1] / (full[0] / full[1]) - 1) > ASPECT_TOLERANCE:
-            raise InputError(f"{cameras.names[view]} is {size[0]}x{size[1]}, in the scene {full[0]}x{full[1]}; they "
-                             "must have the same aspect ratio")  # fmt: skip
+            raise InputError(f"{cameras.names[view]} is {size[0]}x{size[1]} pixels, but {full[0]}x{full[1]} in the "
+                             "scene; both must have the same aspect ratio")  # fmt: skip
         K = resize(K, size[0] / full[0], size[1] / full[1])
         return cls(K, size, lens, cameras.Ks[view], tuple(cameras.sizes[view].tolist()))
 

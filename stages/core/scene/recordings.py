@@ -24,7 +24,7 @@ def list_recordings(folder: Path) -> dict[str, Path]:
         raise InputError(f"{folder}: is not a folder; give one with a video, or a folder of frames, for each camera")
     found = {p.name: p for p in sorted(folder.iterdir()) if p.name[0] != "." and _is_recording(p)}
     if len(found) < 2:
-        raise InputError(f"{folder}: holds {len(found)} videos or folders of frames; two cameras or more are needed")
+        raise InputError(f"{folder}: contains {len(found)} videos or folders of frames; two cameras or more are needed")
     return found
 
 
@@ -47,8 +47,9 @@ def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
     name, rate = next(iter(rates.items()))
     other = next((n for n, r in rates.items() if abs(r - rate) > 1e-3 * rate), None)
     if other is not None:
-        raise InputError(f"{recordings[other]}: has {rates[other]:g} frames a second, {name} has {rate:g}; all films "
-                         "must have the same rate, and --fps is that of folders of frames")  # fmt: skip
+        raise InputError(f"{recordings[other]}: has {rates[other]:g} frames per second, but {name} has {rate:g}; "
+                         "all films "
+                         "must have the same frame rate (--fps sets the rate of folders of frames)")  # fmt: skip
     return rate
 
 
@@ -60,8 +61,9 @@ def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3
     size = None
     for image, full in read_reduced_video(path, side) if path.is_file() else _read_folder(path, side):
         if full != (size := size or full):
-            raise InputError(f"{path}: has frames of {size[0]}x{size[1]} and of {full[0]}x{full[1]} pixels; a camera's "
-                             "frames have one size")  # fmt: skip
+            raise InputError(f"{path}: has frames of {size[0]}x{size[1]} and of {full[0]}x{full[1]} pixels; all "
+                             "frames of a "
+                             "camera must have the same size")  # fmt: skip
         yield image, full
 
 

@@ -68,7 +68,7 @@ def read_objects(rows: Iterable[Sequence]) -> tuple[SceneObject, ...]:
     """Objects from a file's rows of id, name and material. Raises ValueError for wrong values and duplicate ids."""
     objects = tuple(_read_object(*row) for row in rows)
     if twice := [id for id, count in Counter(o.id for o in objects).items() if count > 1]:
-        raise ValueError(f"object {twice[0]} is there twice")
+        raise ValueError(f"object {twice[0]} occurs twice")
     return objects
 
 

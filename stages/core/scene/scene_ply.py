@@ -47,14 +47,14 @@ def read_scene(path: Path) -> Scene:
     if "vertex" not in ply:
         raise InputError(f"{path}: has no element called vertex; {EXPECTED} is expected")
     if not len(ply["vertex"].data):
-        raise InputError(f"{path}: holds no Gaussians; {EXPECTED} is expected")
+        raise InputError(f"{path}: contains no Gaussians; {EXPECTED} is expected")
     try:
         raw = unpack(ply) if is_packed(ply) else ply["vertex"].data
         gaussians = _activate(path, raw)
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(f"{path}: its properties are damaged ({reason(error)}); {EXPECTED} is expected") from error
     if not len(gaussians):
-        raise InputError(f"{path}: holds no Gaussians; {EXPECTED} is expected")
+        raise InputError(f"{path}: contains no Gaussians; {EXPECTED} is expected")
     return _with_header(path, gaussians, ply.comments)
 
 
@@ -85,11 +85,12 @@ def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
     missing = [name for name in REQUIRED + COLOURS if name not in stored]
     if missing:
         raise InputError(
-            f"{path}: no vertex property {', '.join(missing)}; {EXPECTED} is expected (this may be a plain point cloud)"
+            f"{path}: has no vertex property {', '.join(missing)}; {EXPECTED} is expected (this may be a plain "
+            "point cloud)"
         )
     rest = sorted((n for n in stored if re.fullmatch(r"f_rest_[0-9]{1,3}", n)), key=lambda n: int(n.rsplit("_", 1)[1]))
     if len(rest) not in (0, 9, 24, 45):
-        raise InputError(f"{path}: {len(rest)} f_rest properties; SH of degree 1, 2 or 3 has 9, 24 or 45")
+        raise InputError(f"{path}: has {len(rest)} f_rest properties; SH of degree 1, 2 or 3 has 9, 24 or 45")
     table = torch.from_numpy(_columns(raw, REQUIRED + COLOURS + rest))
     n, quats = len(table), table[:, 7:11]
     sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major

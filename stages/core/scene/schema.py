@@ -70,7 +70,7 @@ def numbered(values: object, what: str) -> dict[int, object]:
         raise ValueError(f"{what} is {quote(repr(wrong[0]), 40)}, not a whole number")
     found = {whole(int(key), what): value for key, value in values.items()}
     if len(found) < len(values):
-        raise ValueError(f"{what} is there twice")
+        raise ValueError(f"{what} is used twice")
     return found
 
 
@@ -134,7 +134,7 @@ def _object(pairs: list[tuple[str, object]]) -> dict:
     found = dict(pairs)
     if len(found) < len(pairs):  # Python's json would silently keep the last value
         twice = next(key for i, (key, _) in enumerate(pairs) if key in dict(pairs[:i]))
-        raise ValueError(f"{quote(repr(twice), 40)} is there twice")
+        raise ValueError(f"{quote(repr(twice), 40)} occurs twice")
     return found
 
 

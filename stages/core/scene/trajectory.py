@@ -225,7 +225,7 @@ class TrajectoryWriter:
         if kind is not None and issubclass(kind, InputError) and self.frames:
             kept = self.path.with_name(f"{self.path.stem}.partial.h5")
             self._part.replace(kept)
-            log.warning("%s: the %d frames before the error are kept", kept, self.frames)
+            log.warning("%s: contains the %d frames simulated before the error", kept, self.frames)
         self._replacing.__exit__(kind, error, trace)
 
 
@@ -281,7 +281,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 raise InputError(f"{path}: version {version:g} is newer than {VERSION}; upgrade ngff")
             return _read(path, file)
     except KeyError as error:
-        raise InputError(f"{path}: a part of the trajectory is missing ({quote(error.args[0])}); see "
+        raise InputError(f"{path}: a part of the trajectory is missing ({quote(error.args[0])}); for the format see "
                          "stages/core/scene/README.md") from error  # fmt: skip
     except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises any of these
         why = reason(error)
@@ -302,7 +302,7 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     motion = (values("keypoints/positions"), values("objects/com"), values("objects/rotation"))
     gaussians = Gaussians(**{f.name: values(f"gaussians/{f.name}") for f in fields(Gaussians)})
     if not len(motion[0]) or not len(gaussians):
-        raise InputError(f"{path}: has no {'Gaussians' if len(motion[0]) else 'frames'}")
+        raise InputError(f"{path}: has no {'Gaussians' if len(motion[0]) else 'frames'}; simulate again")
     if lengths["k"] not in (1, 4, 9, 16):
         raise ValueError(f"gaussians/sh has {lengths['k']} coefficients, not 1, 4, 9 or 16")
     _check_unit(gaussians.quats, "gaussians/quats")

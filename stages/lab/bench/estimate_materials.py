@@ -70,7 +70,7 @@ def object_names(objects: str) -> list[str]:
         names = [name.strip() for name in objects.split(",") if name.strip()]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise InputError(f"--objects {objects}: {twice.pop()!r} is there twice; names must be unique")
+        raise InputError(f"--objects {objects}: {twice.pop()!r} occurs twice; names must be unique")
     return names
 
 

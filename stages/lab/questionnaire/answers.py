@@ -105,7 +105,7 @@ def _checked(data: dict, shown: list[str], scales: list[str], points: int) -> tu
     for answer in data["answers"]:
         film = answer["film"]
         if film not in shown or film in rated or film in skipped:
-            raise ValueError(f"film {quote(repr(film), 40)} was not shown, or is there twice")
+            raise ValueError(f"film {quote(repr(film), 40)} was not shown, or occurs twice")
         if answer.get("unplayable"):
             skipped.add(film)
         else:

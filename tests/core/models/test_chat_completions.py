@@ -45,11 +45,14 @@ def test_question_and_reply(chat_server):
 
 @pytest.mark.parametrize(("script", "says"), [
     ([401], "401 .*so it is.*; check OPENAI_API_KEY"), ([404], "404 .*has the model 'seer'"), ([400], "accepts images"),
-    ([503, 500, 429], "429 .*, 3 times; try later"), ([b"<html>"] * 3, CHOICES), ([b"{}"] * 3, CHOICES),
+    ([503, 500, 429], "429 .*, in each of 3 attempts; try again later"),
+    ([b"<html>"] * 3, CHOICES), ([b"{}"] * 3, CHOICES),
     ([b'{"choices": []}'] * 3, CHOICES), ([b"[" * 100_000] * 3, CHOICES), ([b"\xff\xfe"] * 3, CHOICES),
-    ([b" " * 5000] * 3, "larger than 0 MB, 3 times"), ([truncated] * 3, "breaks off, 3 times"),
-    (["close"] * 3, "no connection .*, 3 times"), ([silent] * 3, "no answer within 0.1 s, 3 times"),
-    ([dripping] * 3, "no answer within 0.1 s, 3 times"),
+    ([b" " * 5000] * 3, "larger than 0 MB, in each of 3 attempts"),
+    ([truncated] * 3, "breaks off, in each of 3 attempts"),
+    (["close"] * 3, "no connection .*, in each of 3 attempts"),
+    ([silent] * 3, "no answer within 0.1 s, in each of 3 attempts"),
+    ([dripping] * 3, "no answer within 0.1 s, in each of 3 attempts"),
 ])  # fmt: skip
 def test_failing_servers(chat_server, monkeypatch, script, says):
     monkeypatch.setattr(chat_completions, "LARGEST_REPLY", 4000)

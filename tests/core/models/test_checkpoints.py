@@ -158,7 +158,9 @@ def test_checkpoints_with_code_and_compressed_ones_are_refused(tmp_path):
         for name in plain.namelist():
             bomb.writestr(name, plain.read(name))
     for name in ("code.pth", "bomb.pth"):
-        with pytest.raises(InputError, match=f"{name}: cannot be read .* damaged or holds other things than tensors"):
+        with pytest.raises(
+            InputError, match=f"{name}: cannot be read .* damaged or contains other objects than tensors"
+        ):
             load(tmp_path / name)
 
 

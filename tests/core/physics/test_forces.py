@@ -66,16 +66,17 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     ({"force": ["object=2 force=0,0,1 from=x"]}, "'x' is not a number"),
     ({"force": ["object=2 force=0,0,1 from=0.3 to=0.1"]}, "the end must come after"),
     ({"force": ["object=2 force=0,0,1 from=-1 to=1"]}, "the simulation begins at 0 s"),
-    ({"force": ["object=9 force=0,0,1"]}, "'9' is not an object of this scene; there are: 1 \\(duck\\), 2 \\(phone\\)"),
+    ({"force": ["object=9 force=0,0,1"]},
+     "'9' is not an object of this scene; the scene has: 1 \\(duck\\), 2 \\(phone\\)"),
     ({"pin": ["cow"]}, "--pin 'cow'"),
     ({"velocity": ["1 0,0,2"]}, 'write "object=1 0,0,2"'),
     ({"velocity": ["object=1 fast"]}, "three numbers"),
     ({"lift": ["high"]}, "'high' is not a number"),
     ({"lift": ["3=1"]}, "not an object"),
     ({"lift": ["nan"]}, "not finite"),
-    ({"lift": ["0.1", "0.2"]}, r"--lift '0.2': object 1 \(duck\) is there twice"),
-    ({"lift": ["1=0.1", "duck=0.2"]}, r"--lift 'duck=0.2': object 1 \(duck\) is there twice"),
-    ({"velocity": ["object=2 0,0,1", "object=phone 0,0,2"]}, r"object 2 \(phone\) is there twice"),
+    ({"lift": ["0.1", "0.2"]}, r"--lift '0.2': object 1 \(duck\) occurs twice"),
+    ({"lift": ["1=0.1", "duck=0.2"]}, r"--lift 'duck=0.2': object 1 \(duck\) occurs twice"),
+    ({"velocity": ["object=2 0,0,1", "object=phone 0,0,2"]}, r"object 2 \(phone\) occurs twice"),
 ])  # fmt: skip
 def test_invalid_prompts(prompt, message):
     with pytest.raises(InputError, match=message):
@@ -132,7 +133,7 @@ def test_files_of_forces_are_lists_of_bounded_length(tmp_path, monkeypatch):
     path.write_text(json.dumps([row, row]))
     assert read_forces(path, "any", OBJECTS) == [Force(2, torque=(0.0, 0.0, 1.0), end=0.5)] * 2
     monkeypatch.setattr(forces, "MAX_ROWS", 1)
-    with pytest.raises(InputError, match="f.json: has 2 entries; at most 1 are read"):
+    with pytest.raises(InputError, match="f.json: has 2 entries; at most 1 are allowed"):
         read_forces(path, "any", OBJECTS)
     path.write_text('{"any": {}}')
     with pytest.raises(InputError, match="f.json: must be {scene name"):
@@ -142,5 +143,5 @@ def test_files_of_forces_are_lists_of_bounded_length(tmp_path, monkeypatch):
 @pytest.mark.parametrize("text", ["1e9", "-1e9"])
 def test_numbers_up_to_a_billion(text):
     assert number(text, "x") == float(text)
-    with pytest.raises(InputError, match="x: .* is not finite, or beyond 1e"):
+    with pytest.raises(InputError, match="x: .* is not finite or exceeds 1e"):
         number(text.replace("1", "1.1"), "x")

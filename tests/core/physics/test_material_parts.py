@@ -92,7 +92,7 @@ def test_a_segment_has_what_is_nearest_to_its_gaussians(tmp_path, segment):
 def test_a_segment_elsewhere_is_refused(tmp_path):
     write_parts(tmp_path, torch.cat([column(), column() + 100]), [0] * 8 + [4] * 8)
     choice = choose(tmp_path, [{"segment": "pot", "in": "parts.ply", "material": POT}, {"material": LEAF}])
-    with pytest.raises(InputError, match=r"parts.ply: nothing of object 1 \(plant\) is in its pot"):
+    with pytest.raises(InputError, match=r"parts.ply: no part of object 1 \(plant\) is in its object pot"):
         located(choice, gaussians_at(column(), [1] * 8), OBJECTS[0])
 
 

@@ -64,7 +64,7 @@ def test_options_override_the_scene_and_the_scene_overrides_the_name(tmp_path):
 
 @pytest.mark.parametrize("prompt, message", [
     ("duck", "OBJECT=MATERIAL"), ("duck=", "OBJECT=MATERIAL"), ("duck=cheese", "choose from rubber"),
-    ("cow=rubber", "there are: 1 \\(rubber duck\\)"), ("e=rubber", "fits 3 objects"),
+    ("cow=rubber", "the scene has: 1 \\(rubber duck\\)"), ("e=rubber", "matches 3 objects"),
 ])  # fmt: skip
 def test_invalid_prompts(prompt, message):
     with pytest.raises(InputError, match=message):
@@ -72,7 +72,7 @@ def test_invalid_prompts(prompt, message):
 
 
 def test_an_object_has_one_material_of_the_command_line():
-    with pytest.raises(InputError, match=r"--material '1=steel': object 1 \(rubber duck\) is there twice"):
+    with pytest.raises(InputError, match=r"--material '1=steel': object 1 \(rubber duck\) occurs twice"):
         choose_materials(OBJECTS, ["duck=rubber", "1=steel"])
 
 
@@ -80,7 +80,7 @@ def test_an_object_has_one_material_of_the_command_line():
     ("{", "not JSON"), ("[]", "object name or id"), ('{"duck": 3}', "material's name"),
     ('{"duck": {"E": 1e5}}', "E, density"), ('{"duck": {"E": -1, "density": 1}}', "positive"),
     ('{"duck": {"E": 1e5, "density": 1e6}}', "density positive and below 1e5"),
-    ('{"duck": "wood", "1": "steel"}', r"m.json: 1: object 1 \(.*duck.*\) is there twice; give it one material"),
+    ('{"duck": "wood", "1": "steel"}', r"m.json: 1: object 1 \(.*duck.*\) occurs twice; give it one material"),
     ('{"duck": {"E": 1e5, "density": 100, "nu": 0.5}}', "nu"), ('{"duck": {"E": "x", "density": 1}}', "numbers"),
     ('{"duck": {"E": 1e5, "density": 1, "colour": 1}}', "friction"),
     ('{"duck": {"E": 1e5, "density": 1, "friction": -1}}', "friction must be"),
@@ -132,7 +132,7 @@ def test_models_of_materials(tmp_path):
     wrong = [
         ({"model": "jello"}, "no material model called 'jello'; choose from neo-hookean"),
         ({"model": 3}, "no material model called 3"), ({"plastic": [1, 2]}, "plastic three of them"),
-        ({"model": "sand"}, "the first of plastic must be positive for sand; .*angle of friction"),
+        ({"model": "sand"}, "the first number of plastic must be positive for sand; .*angle of friction"),
         ({"model": "snow", "plastic": [0, 1, 1]}, "must be positive for snow"), ({"source": "me"}, "with any of E"),
     ]  # fmt: skip
     for values, message in wrong:
@@ -151,8 +151,8 @@ def test_a_softened_material_yields_at_the_same_strain():
 
 
 def test_a_file_that_names_an_object_twice_or_by_part_of_its_name():
-    with pytest.raises(InputError, match="'' is not an object of this scene; there are: none"):
+    with pytest.raises(InputError, match="'' is not an object of this scene; the scene has: none"):
         find_object(" ", [], "x")
     assert find_object("3", (*OBJECTS, SceneObject(4, "cup 3")), "").id == 3  # ids have priority over parts of names
-    with pytest.raises(InputError, match="'cup' fits 2 objects"):
+    with pytest.raises(InputError, match="'cup' matches 2 objects"):
         find_object("cup", (SceneObject(1, "cup a"), SceneObject(2, "cup b")), "x")

@@ -154,8 +154,8 @@ def test_folders_are_made_with_those_above_them(tmp_path, monkeypatch):
     assert make_folder(tmp_path / "a/b").is_dir() and make_folder(tmp_path / "a/b").is_dir()
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file/a"):
-        with pytest.raises(InputError, match=f"{path}: is no folder and cannot become one"):
+        with pytest.raises(InputError, match=f"{path}: is not a folder and cannot be created"):
             make_folder(path)
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write everywhere
-    with pytest.raises(InputError, match="a: cannot be written to"):
+    with pytest.raises(InputError, match="a: is not writable"):
         make_folder(tmp_path / "a")

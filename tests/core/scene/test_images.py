@@ -139,8 +139,8 @@ def test_refused_videos_are_closed(tmp_path, monkeypatch):
         with pytest.raises(InputError) as error:
             next(read_video(tmp_path / name))
         errors.append(error)
-    assert "sound.wav: holds no video stream" in str(errors[0].value)
-    assert "film.mp4: has frames of 64x32 pixels; at most" in str(errors[1].value)
+    assert "sound.wav: contains no video stream" in str(errors[0].value)
+    assert "film.mp4: has frames of 64x32 pixels, but at most" in str(errors[1].value)
     assert os.listdir("/proc/self/fd") == before
     monkeypatch.setattr(images, "MAX_VIDEO_PIXELS", 32 * 64)
     assert next(read_video(tmp_path / "film.mp4")).shape == (32, 64, 3)
@@ -249,7 +249,7 @@ def test_images_of_other_types_are_refused_in_one_line(tmp_path, dtype, capfd):
 
 
 def test_folders_without_photos_and_long_files_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="no photos in it; these formats are read: .*.png"):
+    with pytest.raises(InputError, match="contains no photos; supported formats: .*.png"):
         list_photos(tmp_path)
     write_png(tmp_path / "a.png", torch.zeros(4, 4, 3))
     with pytest.raises(InputError, match="a.png: is not a folder"):
@@ -285,7 +285,7 @@ def test_a_film_of_another_number_of_frames_than_it_states(tmp_path, monkeypatch
         monkeypatch.setattr(images, "video_info", lambda path, stated=stated: (stated, 10.0))
         assert len(sample_frames(tmp_path / "v.mp4", 3, 16)) == 3
     monkeypatch.setattr(images, "read_video", lambda path: iter(()))
-    with pytest.raises(InputError, match="v.mp4: holds no frames"):
+    with pytest.raises(InputError, match="v.mp4: contains no frames"):
         sample_frames(tmp_path / "v.mp4", 3, 16)
 
 
@@ -300,11 +300,11 @@ def test_a_film_that_breaks_off_is_refused_or_used_up_to_there(tmp_path, caplog)
     assert len(list(read_reduced_video(tmp_path / "v.mp4", 32))) == 9 and not caplog.text
     for name, message in (
         ("cut.mp4", r"; \d of its 9 frames are used"),
-        ("zeros.mp4", ".*; the frames before are used"),
+        ("zeros.mp4", ".*; the frames before the damage are used"),
     ):
         assert 0 < len(list(read_reduced_video(tmp_path / name, 32))) < 9
         assert re.search(f"{name}: is truncated or damaged{message}", caplog.text)
-        with pytest.raises(InputError, match=f"{name}: the video breaks off or is damaged"):
+        with pytest.raises(InputError, match=f"{name}: the video is truncated or damaged"):
             list(read_video(tmp_path / name))
 
 

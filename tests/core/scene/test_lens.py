@@ -179,6 +179,8 @@ def test_cropped_photo_without_distortion():
 
 def test_another_aspect_ratio_is_refused():
     cameras = camera(LENSES["barrel"], (320, 200))  # the view is 160x120
-    with pytest.raises(InputError, match="a.jpg is 160x120, in the scene 320x200; they must have the same aspect"):
+    with pytest.raises(
+        InputError, match="a.jpg is 160x120 pixels, but 320x200 in the scene; both must have the same aspect"
+    ):
         Undistortion.of(cameras, 0, (160, 120))
     assert Undistortion.of(cameras, 0, (160, 120), undistorted=True).size == (160, 120)

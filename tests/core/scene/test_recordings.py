@@ -35,7 +35,7 @@ def test_recordings_are_films_and_folders_of_frames_by_name(tmp_path):
     found = list_recordings(tmp_path)
     assert list(found) == ["a", "b.mp4"] and found["a"] == tmp_path / "a"
     (tmp_path / "b.mp4").unlink()
-    with pytest.raises(InputError, match="holds 1 videos or folders of frames; two cameras or more"):
+    with pytest.raises(InputError, match="contains 1 videos or folders of frames; two cameras or more"):
         list_recordings(tmp_path)
     with pytest.raises(InputError, match="is not a folder; give one with a video"):
         list_recordings(tmp_path / "notes.txt")
@@ -49,9 +49,9 @@ def test_films_of_other_rates_are_refused(tmp_path):
     assert common_frame_rate(films, 99.0) == pytest.approx(25)
     assert common_frame_rate({**films, "d": folder}, 25.01) == pytest.approx(25, abs=0.02)
     assert common_frame_rate({"d": folder, "e": folder}, 60.0) == 60.0
-    with pytest.raises(InputError, match="d: has 25.1 frames a second, a.mp4 has 25; all films"):
+    with pytest.raises(InputError, match="d: has 25.1 frames per second, but a.mp4 has 25; all films"):
         common_frame_rate({**films, "d": folder}, 25.1)
-    with pytest.raises(InputError, match="c.mp4: has 30 frames a second, a.mp4 has 25"):
+    with pytest.raises(InputError, match="c.mp4: has 30 frames per second, but a.mp4 has 25"):
         common_frame_rate({**films, "c.mp4": tmp_path / "c.mp4"}, 25.0)
 
 
@@ -68,7 +68,9 @@ def test_frames_are_read_in_order_at_limited_size(tmp_path):
 def test_frames_of_other_sizes_are_refused(tmp_path):
     folder = write_frames(tmp_path / "a", 0.2)
     write_png(folder / "1.png", torch.zeros(20, 32, 3))
-    with pytest.raises(InputError, match="a: has frames of 32x24 and of 32x20 pixels; a camera's frames have one size"):
+    with pytest.raises(
+        InputError, match="a: has frames of 32x24 and of 32x20 pixels; all frames of a camera must have the same size"
+    ):
         list(read_recording(folder, 16))
 
 

@@ -212,7 +212,7 @@ def test_files_without_gaussians_or_of_another_degree_or_version_are_refused(tmp
              *(f"rot_{i}" for i in range(4))]  # fmt: skip
     for count, more, element, message in (
         # the second file has quaternions of length 0
-        (0, [], "vertex", "holds no Gaussians"), (2, [], "vertex", "holds no Gaussians"),
+        (0, [], "vertex", "contains no Gaussians"), (2, [], "vertex", "contains no Gaussians"),
         (2, [], "points", "has no element called vertex"),
         (2, [f"f_rest_{i}" for i in range(8)], "vertex", "8 f_rest properties; SH of degree 1, 2 or 3"),
     ):  # fmt: skip
@@ -250,7 +250,7 @@ def test_what_could_not_be_read_is_not_written(tmp_path, two_balls):
 
 def test_an_object_that_is_there_twice_is_refused(tmp_path, two_balls):
     write_scene(tmp_path / "s.ply", replace(two_balls, objects=two_balls.objects[:1] * 2))
-    with pytest.raises(InputError, match="object 1 is there twice"):
+    with pytest.raises(InputError, match="object 1 occurs twice"):
         read_scene(tmp_path / "s.ply")
 
 

@@ -110,7 +110,7 @@ def test_json_files_may_begin_with_the_mark_of_windows(tmp_path):
 
 def test_json_objects_have_one_value_of_each_key():
     for data in ('{"1": "duck", "2": "cup", "1": "bowl"}', '[{"a": {"1": 0, "1": 0}}]'):
-        with pytest.raises(ValueError, match="^'1' is there twice$"):
+        with pytest.raises(ValueError, match="^'1' occurs twice$"):
             parse_json(data)
     assert parse_json('{"a": {"1": 0}, "b": {"1": 0}}') == {"a": {"1": 0}, "b": {"1": 0}}
 
@@ -172,7 +172,7 @@ def test_objects_have_ids_from_1_and_names():
                          ((3, "x", 1), "material of object 3"), ((MAX_OBJECT_ID + 1, "x", ""), "id")):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             read_objects([row])
-    with pytest.raises(ValueError, match="object 4 is there twice"):
+    with pytest.raises(ValueError, match="object 4 occurs twice"):
         read_objects([(4, "a", ""), (5, "b", ""), (4, "c", "")])
 
 
@@ -239,6 +239,9 @@ def test_sequences_are_json_objects():
 
 
 def test_a_file_is_not_written_over_a_folder_nor_into_none(tmp_path):
-    for path, message in ((tmp_path, "is a folder; name the file"), (tmp_path / "a" / "b", "there is no folder")):
+    for path, message in (
+        (tmp_path, "is a folder; give the name of the file"),
+        (tmp_path / "a" / "b", "there is no folder"),
+    ):
         with pytest.raises(InputError, match=message), replacing(path) as part:
             Path(part).write_text("x")

@@ -168,7 +168,7 @@ def damage(path, scene, how: str):
 @pytest.mark.parametrize(
     ("how", "message"),
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
-     ("frames", "other datasets need"), ("ids", "object 1 is there twice"), ("weights", "does not sum to 1"),
+     ("frames", "other datasets need"), ("ids", "object 1 occurs twice"), ("weights", "does not sum to 1"),
      ("index", "binding does not fit the 1700 Gaussians and 10 keypoints"),
      ("quats", "gaussians/quats has a quaternion that is not of length 1"), ("rotation", "objects/rotation has a")],
 )  # fmt: skip

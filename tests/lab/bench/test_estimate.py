@@ -123,7 +123,7 @@ def test_a_failing_server_leaves_no_file(chat_server, video, tmp_path):
 def test_names_are_read_from_a_scene(two_balls, tmp_path):
     write_scene(tmp_path / "s.ply", two_balls)
     assert estimate.object_names(str(tmp_path / "s.ply")) == ["red ball", "green ball"]
-    with pytest.raises(InputError, match="'duck' is there twice"):
+    with pytest.raises(InputError, match="'duck' occurs twice"):
         estimate.object_names("duck,ball,duck")
 
 

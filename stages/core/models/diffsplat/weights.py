@@ -77,7 +77,8 @@ def find(given: Path | None = None) -> Files:
     code, base = SOURCES
     lack = ", ".join(str(path) for path in _missing(_files(searched[0])))
     raise InputError(
-        f"diffsplat: the weights are not in {' or '.join(map(str, searched))} (no {lack}); fetch {UNET} and {GSVAE} of "
+        f"diffsplat: the weights are not in {' or '.join(map(str, searched))} (no {lack}); download {UNET} and "
+        f"{GSVAE} of "
         f"https://huggingface.co/{code.repository} ({code.size}, licence {code.licence}) into {searched[0]}, and "
         f"{', '.join(PARTS)} of https://huggingface.co/{base.repository} ({base.size}, licence {base.licence}) into "
         f"{searched[0] / BASE}, name such a folder with --weights, or add --download"
@@ -151,10 +152,11 @@ def _unet(config: Path) -> nn.Module:
         with torch.device("meta"):
             unet = UNet2DConditionModel(**known)
     except (ValueError, TypeError) as error:
-        raise InputError(f"{config}: does not describe DiffSplat's U-Net ({error}); fetch it again") from error
+        raise InputError(f"{config}: does not describe DiffSplat's U-Net ({error}); download it again") from error
     if unet.config.in_channels != IN_CHANNELS:
-        raise InputError(f"{config}: describes a U-Net with {unet.config.in_channels} channels in; the one that takes "
-                         f"an image has {IN_CHANNELS}: {UNET} is meant")  # fmt: skip
+        raise InputError(f"{config}: describes a U-Net with {unet.config.in_channels} input channels; the one "
+                         "that takes "
+                         f"an image has {IN_CHANNELS}; use {UNET}")  # fmt: skip
     return unet
 
 
@@ -165,6 +167,6 @@ def filled(model: nn.Module, path: Path, prefix: str = "", but: tuple[str, ...] 
     """
     state = {k.removeprefix(prefix): v.float() for k, v in read_state(path).items() if not k.startswith(but)}
     if complaint := differences(model.state_dict(), state):
-        raise InputError(f"{path}: does not fit diffsplat: {complaint}")
+        raise InputError(f"{path}: the weights do not fit diffsplat: {complaint}")
     model.load_state_dict(state, assign=True)
     return model

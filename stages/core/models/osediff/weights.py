@@ -65,7 +65,7 @@ def find(given: Path | None = None) -> OSEDiffFiles:
     nearest = min(searched, key=lambda folder: len(missing[folder]))
     raise InputError(
         f"osediff: the weights are not in {' or '.join(map(str, searched))} ({nearest} lacks "
-        f"{', '.join(missing[nearest])}); fetch preset/models/{LORA} of https://github.com/cswry/OSEDiff (licence "
+        f"{', '.join(missing[nearest])}); download preset/models/{LORA} of https://github.com/cswry/OSEDiff (licence "
         f"Apache-2.0) into {nearest}, and {', '.join(PARTS)} of https://huggingface.co/{SOURCE.repository} or of its "
         f"copy {COPY} ({SOURCE.size}, licence {SOURCE.licence}) into {nearest / BASE}"
     )
@@ -108,7 +108,9 @@ def read_lora(path: Path) -> dict:
              for adapters in ADAPTERS.values() for key in adapters.values()}  # fmt: skip
     lack = [key for key, usable in {**numbers, **tensors, **names}.items() if not usable(entries.get(key))]
     if lack:
-        raise InputError(f"{path}: is not {LORA} of OSEDiff (missing or unusable: {', '.join(lack)}); fetch it again")
+        raise InputError(
+            f"{path}: is not {LORA} of OSEDiff (missing or unusable: {', '.join(lack)}); download it again"
+        )
     return entries
 
 
@@ -126,7 +128,9 @@ def merge_lora(model: nn.Module, lora: dict, network: str, path: Path) -> None:
     for adapter, key in ADAPTERS[network].items():
         for name in dict.fromkeys(lora[key]):  # the public code lists layers of the encoder several times
             if not isinstance(layers.get(name), nn.Linear | nn.Conv2d):
-                raise InputError(f"{path}: does not fit osediff: {key} lists {name[:80]!r}, no layer of the {network}")
+                raise InputError(
+                    f"{path}: does not fit osediff: {key} lists {name[:80]!r}, which is no layer of the {network}"
+                )
             weight, a, b = (layers[name].weight, *(f"{name}.lora_{c}.{adapter}.weight" for c in "AB"))
             wanted[a] = torch.empty(rank, *weight.shape[1:], device="meta")
             wanted[b] = torch.empty(len(weight), rank, *[1] * (weight.dim() - 2), device="meta")

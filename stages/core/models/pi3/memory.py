@@ -71,6 +71,7 @@ def plan(config: Pi3Config, views: int, size: tuple[int, int], splats: bool, hal
     need = activations(config, views, size, 1, splats, half) / 1e9
     remedy = f"{maximum} photos would fit" if maximum else "no photo fits"
     raise InputError(
-        f"{views} photos of {size[1]}x{size[0]} need {need:.1f} GB besides the weights, and {room / 1e9:.1f} GB are "
+        f"{views} photos of {size[1]}x{size[0]} pixels need {need:.1f} GB besides the weights, but "
+        f"{room / 1e9:.1f} GB are "
         f"free: {remedy}; give fewer photos, a smaller --resolution, or --device cpu"
     )

@@ -55,7 +55,7 @@ def find(name: str, given: Path | None = None) -> Path:
                 return file
     source = PUBLISHED[name]
     raise InputError(
-        f"{name}: no weights in {' or '.join(str(p) for p in searched)}; fetch them from "
+        f"{name}: no weights in {' or '.join(str(p) for p in searched)}; download them from "
         f"https://huggingface.co/{source.repository} ({source.size}, licence {source.licence}) and save them as "
         f"{searched[0] / name}.safetensors, name the file with --weights, or add --download"
     )
@@ -76,7 +76,7 @@ def load(path: Path, name: str) -> nn.Module:
         what = f"include no {error.args[0]}" if isinstance(error, KeyError) else "are those of another network"
         raise InputError(
             f"{path}: holds no weights of {name} (its {len(state)} tensors {what}); "
-            f"those at https://huggingface.co/{source.repository} are meant"
+            f"download them from https://huggingface.co/{source.repository}"
         ) from error
     with torch.device("meta"):
         model = source.network(config)
@@ -94,7 +94,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             return dense_tensors(path, load_file(path))
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise InputError(f"{path}: is not a complete safetensors file ({reason(error)}); fetch it again") from error
+        raise InputError(f"{path}: is not a complete safetensors file ({reason(error)}); download it again") from error
     data = read_checkpoint(path)
     for key in ("state_dict", "model_state_dict", "model", "module"):
         if isinstance(data, dict) and isinstance(data.get(key), dict):

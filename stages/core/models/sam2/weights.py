@@ -36,7 +36,7 @@ def find(given: Path | None = None) -> Path:
         if all((place / file).is_file() for file in FILES):
             return place / FILES[1]
     raise InputError(
-        f"sam2: no {' with '.join(FILES)} in {' or '.join(str(p) for p in places)}; fetch both from "
+        f"sam2: no {' with '.join(FILES)} in {' or '.join(str(p) for p in places)}; download both from "
         f"https://huggingface.co/{SOURCE.repository} ({SOURCE.size}, licence {SOURCE.licence}; {SMALLEST} is faster "
         f"on a CPU) into {places[0]}, name their folder with --weights, or add --download"
     )
@@ -119,5 +119,6 @@ def _config(kind: type, file: Path):
 
 
 def _unfit(path: Path, what: str) -> InputError:
-    return InputError(f"{path}: does not fit the config.json next to it: {what}; fetch both from one repository, such "
+    return InputError(f"{path}: does not fit the config.json next to it: {what}; download both from one "
+                      "repository, such "
                       f"as {SOURCE.repository}")  # fmt: skip

@@ -43,7 +43,9 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], limits:
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
     surfels, index, view = scene_surfels(scene)
     if not len(surfels):
-        raise InputError(f"--points {clicks[0].text!r}: the scene has no surface in reach of its cameras")
+        raise InputError(
+            f"--points {clicks[0].text!r}: the scene has no surface close enough to its cameras; reconstruct it again"
+        )
     means = scene.gaussians.means[index]
     found: dict[int, tuple[float, Int[Tensor, "n"]]] = {}
     scored = [score_at(surfels, scale, model) for scale in (*SCALES, *REDUCTIONS)]
@@ -59,10 +61,14 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], limits:
                 found[number] = float(at_scale.ious[best]), at_scale.labels(np.array([best])) == 0
     for click in clicks:
         if click.object not in found:
-            log.warning("--points %r: no object was found there; click on the middle of one, or mark it with --boxes "
+            log.warning("--points %r: no object was found at this point; choose a point in the middle of the "
+                        "object, or mark it with --boxes "
                         "or --masks", click.text)  # fmt: skip
     if not found:
-        raise InputError(f"--points {clicks[0].text!r}: there is no object at any of the points")
+        raise InputError(
+            f"--points {clicks[0].text!r}: there is no object at any of the points; choose points in the middle "
+            "of objects, or use --boxes or --masks"
+        )
     labels = torch.zeros(len(surfels), dtype=torch.int64)
     for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small objects last
         labels[members] = number

@@ -54,7 +54,7 @@ def find(given: Path | None = None) -> Path:
     places = [given] if given is not None else [*([Path(folder) / WEIGHTS.name] if folder else []), WEIGHTS]
     found = next((Path(p) for p in places if Path(p).is_file()), None)
     if found is None:
-        raise InputError(f"{places[-1]}: no such weights of the segmentation network; train them with "
+        raise InputError(f"{places[-1]}: there are no such weights of the segmentation network; train them with "
                          "`ngff-lab train-segmenter`")  # fmt: skip
     return found
 

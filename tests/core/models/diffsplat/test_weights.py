@@ -77,10 +77,10 @@ def test_mismatched_weights_are_refused(copy):
     save_file(text_state, text_encoder, metadata={"format": "pt"})
     text_only = {**json.loads((files.unet / "config.json").read_text()), "in_channels": 10}
     (files.unet / "config.json").write_text(json.dumps(text_only))
-    with pytest.raises(InputError, match="10 channels in; the one that takes an image has 11"):
+    with pytest.raises(InputError, match="10 input channels; the one that takes an image has 11"):
         load(files)
     (files.base / "vae/diffusion_pytorch_model.safetensors").write_bytes(b"no")
-    with pytest.raises(InputError, match="Stable Diffusion 1.5 .*fetch"):
+    with pytest.raises(InputError, match="Stable Diffusion 1.5 .*download"):
         load(files)
 
 
@@ -168,5 +168,7 @@ def test_missing_network_is_explained(hub):
         raise ConnectionError("no route\n to host")
 
     hub.HfApi = lambda: SimpleNamespace(model_info=fails)
-    with pytest.raises(InputError, match="chenguolin/DiffSplat could not be fetched .no route to host.; .*--weights"):
+    with pytest.raises(
+        InputError, match="chenguolin/DiffSplat could not be downloaded .no route to host.; .*--weights"
+    ):
         download()

@@ -37,7 +37,7 @@ def test_weight_search_order(folder, tmp_path):
     assert find(tmp_path).base == tmp_path / "cache/ngff/osediff" / BASE
     assert find(folder).lora == folder / "osediff" / LORA
     shutil.rmtree(tmp_path / "cache/ngff/osediff" / BASE / "unet")
-    with pytest.raises(InputError, match=f"cache/ngff/osediff lacks {BASE}/unet.; fetch"):
+    with pytest.raises(InputError, match=f"cache/ngff/osediff lacks {BASE}/unet.; download"):
         find()
 
 
@@ -77,7 +77,9 @@ def test_missing_entries_and_unknown_layers_are_refused(lora, tmp_path):
     check_refused({**lora, "state_dict_vae": []}, tmp_path / "a", "unusable: state_dict_vae")
     check_refused([lora], tmp_path / "a", "is not osediff.pkl of OSEDiff")
     for name in ("conv_norm_out", "nowhere.to_q"):
-        check_refused({**lora, "unet_lora_others_modules": [name]}, tmp_path / "a", f"lists '{name}', no layer of")
+        check_refused(
+            {**lora, "unet_lora_others_modules": [name]}, tmp_path / "a", f"lists '{name}', which is no layer of"
+        )
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path):
@@ -100,7 +102,9 @@ def test_another_base_is_refused(folder, tmp_path):
         load(files)
     scheduler.write_text(json.dumps(config))
     (files.base / "unet/diffusion_pytorch_model.safetensors").write_bytes(b"no")
-    with pytest.raises(InputError, match=f"{BASE}: cannot be read as Stable Diffusion 2.1 base .*fetch its tokenizer"):
+    with pytest.raises(
+        InputError, match=f"{BASE}: cannot be read as Stable Diffusion 2.1 base .*download its tokenizer"
+    ):
         load(files)
 
 

@@ -86,7 +86,7 @@ def test_other_networks_and_broken_files_are_refused(tmp_path):
         load(tmp_path / "pi3.safetensors", "pi3-splat")
     for name in ("a.safetensors", "a.pth"):
         (tmp_path / name).write_bytes(b"not at all")
-        with pytest.raises(InputError, match=f"{name}: .*fetch it again"):
+        with pytest.raises(InputError, match=f"{name}: .*download it again"):
             load(tmp_path / name, "pi3")
 
 
@@ -97,7 +97,7 @@ def test_pickle_with_code_is_refused(tmp_path):
 
 
 def test_weight_search_order(tmp_path):
-    with pytest.raises(InputError, match=r"weights or .*cache/ngff; fetch .*yyfz233/Pi3 .*CC BY-NC.*--download"):
+    with pytest.raises(InputError, match=r"weights or .*cache/ngff; download .*yyfz233/Pi3 .*CC BY-NC.*--download"):
         find("pi3")
     folder = tmp_path / "cache/ngff/pi3"
     folder.mkdir(parents=True)

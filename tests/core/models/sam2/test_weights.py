@@ -18,8 +18,10 @@ pytestmark = pytest.mark.usefixtures("empty_weight_folders")
 
 
 def test_weight_search_order(tmp_path):
-    with pytest.raises(InputError, match=r"config.json with model.safetensors in .*weights/sam2 or .*ngff/sam2; fetch "
-                                         r".*facebook/sam2.1-hiera-large \(0.9 GB.*Apache.*--download"):  # fmt: skip
+    with pytest.raises(InputError, match=(
+        r"config.json with model.safetensors in .*weights/sam2 or .*ngff/sam2; download "
+        r".*facebook/sam2.1-hiera-large \(0.9 GB.*Apache.*--download"
+    )):  # fmt: skip
         find()
     save_tiny_model(tmp_path / "cache/ngff/sam2")
     assert find() == tmp_path / "cache/ngff/sam2/model.safetensors"

@@ -39,7 +39,7 @@ def advise(
                    "them closer together, each showing two thirds of what the one before it shows")  # fmt: skip
     out += _left_out(dropped) + _around(cameras, focus) + _heights(cameras, focus)
     if len(cameras) < FEW_PHOTOS:
-        out.append(f"{len(cameras)} photos are few: take {FEW_PHOTOS} to 30 from all around")
+        out.append(f"{len(cameras)} photos are few: take {FEW_PHOTOS} to 30 from all around the objects")
     blurred = [cameras.names[i] for i in (sharpness < MIN_SHARPNESS * sharpness.median()).nonzero()[:, 0].tolist()]
     if blurred:
         out.append(f"blurred compared with the others: {', '.join(blurred[:5])}; hold still, or use more light")
@@ -50,7 +50,10 @@ def advise(
             "transparent surfaces (glass, mirrors) are wrong or missing"
         )
     if not supported:
-        out.append("no table or floor was found, z = 0 is at the lowest points: show more of what is under the objects")
+        out.append(
+            "no table or floor was found, so that z = 0 is at the lowest points: show more of the surface "
+            "under the objects"
+        )
     return out
 
 
@@ -77,7 +80,7 @@ def _around(cameras: Cameras, focus: Float[Tensor, "3"]) -> list[str]:
         return []
     count = math.ceil(gap / PHOTO_SPACING) - 1
     return [
-        f"there is no photo from the {gap:.0f} degrees between {before} and {after}: about {count} more photos from "
+        f"no photo was taken in the {gap:.0f} degrees between {before} and {after}: about {count} more photos from "
         "there would show the sides that are missing now"
     ]
 

@@ -67,7 +67,7 @@ def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCa
         if initial is None:
             initial = initialise.to_gaussians(cloud, torch.full((len(cloud),), 0.8), options.preset.degree)
         gaussians = concatenate([initial, *unmatched_gaussians(observed, cloud, ground, options, device)])
-        log.info("%d Gaussians on surfaces, %d of uncertain depth", len(initial), len(gaussians) - len(initial))
+        log.info("%d Gaussians on surfaces, %d with uncertain depth", len(initial), len(gaussians) - len(initial))
     focus, distance = to_world(ground.focus), to_world.scale * ground.radius
     views = dataclasses.replace(found.views, cameras=found.views.cameras.transformed(to_world))
     gaussians = transformed(gaussians, to_world)
@@ -92,9 +92,10 @@ def _fused_points(
     """Points of consistent depth, about as many as the quality preset has Gaussians."""
     cloud = initialise.fuse(observed.to(device)).to("cpu")
     if len(cloud) < MIN_DEPTH_SAMPLES:
-        raise InputError(f"{found.source}: depth is consistent at too few points ({len(cloud)}); give more, sharper "
-                         "photos, closer together and of objects with some pattern")  # fmt: skip
-    log.info("%d depth samples with %d or more agreeing photos", len(cloud), observed.min_support)
+        raise InputError(f"{found.source}: the photos agree on the depth of too few points ({len(cloud)}); give "
+                         "more and sharper "
+                         "photos, taken closer together, of objects with visible texture")  # fmt: skip
+    log.info("%d depth samples on which %d or more photos agree", len(cloud), observed.min_support)
     return initialise.downsample(cloud, options.preset.gaussians, found.focus, found.radius)
 
 
@@ -102,13 +103,17 @@ def _find_ground(cloud: OrientedPoints, views: Views, found: SceneGeometry, opti
     ground = world_frame.find_ground(cloud.points, views.cameras.viewmats, found.focus, options.seed, options.up)
     ground = world_frame.refine_ground(ground, cloud.points, options.seed)
     if ground.plane is None:
-        log.info("no supporting plane found: up is how the cameras were held, z = 0 is at the lowest points")
+        log.info(
+            "no supporting plane was found: up is taken from how the cameras were held, and z = 0 from the "
+            "lowest points"
+        )
     else:
-        log.info("the supporting plane has %.0f %% of the points in focus", 100 * ground.inlier_fraction)
+        log.info("the supporting plane contains %.0f %% of the points in focus", 100 * ground.inlier_fraction)
     if ground.up_side != "top" and options.up == "auto":
         log.info("the photos are turned: their %s side is up", ground.up_side)
     if ground.rival:
-        log.warning("it is not certain that the %s side of the photos is up and not the %s one; if the scene comes out "
+        log.warning("it is uncertain whether the %s or the %s side of the photos is up; the first is used; if "
+                    "the scene comes out "
                     "tilted, give --up %s", ground.up_side, ground.rival, ground.rival)  # fmt: skip
     return ground
 

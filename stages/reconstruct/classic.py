@@ -60,11 +60,11 @@ def _cameras(
     both = [i for i, name in enumerate(photos.names) if name in row]
     if len(both) < 2:
         raise InputError(
-            f"{options.cameras}: names {len(both)} of the photos in {photos.source}; its paths of images must end in "
+            f"{options.cameras}: names {len(both)} of the photos in {photos.source}; its image paths must end in "
             f"the photos' names, such as {photos.names[0]}"
         )
     if len(both) < len(photos):
-        log.info("left out, without a given camera: %s", ", ".join(sorted(set(photos.names) - set(row))))
+        log.info("photos without a given camera are left out: %s", ", ".join(sorted(set(photos.names) - set(row))))
     photos = photos[both]
     rows = [row[name] for name in photos.names]
     cameras = _rescale_to_photos(photos, cameras[rows], options.cameras)

@@ -100,8 +100,9 @@ def run_colmap(
             elif kind == "error":
                 raise MemoryError(value) if "bad_alloc" in value else RuntimeError(value)
         raise InputError(
-            f"{folder}: COLMAP ended without a result ({_ending(process.wait())}); either memory or the disk is full: "
-            "close other programs, or set TMPDIR to a folder of a disk with more space"
+            f"{folder}: COLMAP ended without a result ({_ending(process.wait())}); memory or the disk is "
+            "probably full: "
+            "close other programs, or set TMPDIR to a folder on a disk with more free space"
         )
 
 

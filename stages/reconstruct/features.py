@@ -72,21 +72,25 @@ def writing_database(folder: Path) -> Iterator[None]:
     length = len(os.fsencode(folder.absolute()))
     if length > MAX_FOLDER_PATH:
         raise InputError(
-            f"the path of the folder {folder.name} has {length} bytes; COLMAP's database can be in one of "
-            f"at most {MAX_FOLDER_PATH}: write to a folder with a shorter path, or set TMPDIR to one"
+            f"the path of the folder {folder.name} has {length} bytes, but COLMAP's database needs a path of "
+            f"at most {MAX_FOLDER_PATH}; write to a folder with a shorter path, or set TMPDIR to one"
         )
     try:
         yield
     except RuntimeError as error:
-        raise InputError(f"{folder}: COLMAP cannot write its files ({reason(error)}); is the disk full?") from error
+        raise InputError(
+            f"{folder}: COLMAP cannot write its files ({reason(error)}); free some space, or check "
+            "the folder's permissions"
+        ) from error
 
 
 def _check_space(folder: Path, needed: int) -> None:
     """Raise InputError unless the folder has this many bytes free, since COLMAP aborts the process on a full disk."""
     free = shutil.disk_usage(folder).free
     if free < needed:
-        raise InputError(f"{folder}: has {free / 1e6:.0f} MB free, and these features need {needed / 1e6:.0f} "
-                         "MB; free some space, or set TMPDIR to a folder of another disk")  # fmt: skip
+        raise InputError(f"{folder}: has {free / 1e6:.0f} MB free, but the features of these photos need "
+                         f"{needed / 1e6:.0f} "
+                         "MB; free some space, or set TMPDIR to a folder on another disk")  # fmt: skip
 
 
 def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -43,23 +43,25 @@ def read_sequence(folder: Path, options: ReconstructOptions) -> tuple[Photos, Fi
     starts = {name: offset + release for name, offset in offsets.items()}
     lengths = {name: len(signals[name].share) + 1 for name in starts}
     if missed := [name for name, start in starts.items() if not 0 <= start < lengths[name]]:
-        log.warning("%s: left out, as the film does not show the release", ", ".join(missed))
+        log.warning("%s: left out, as the film does not show the release of the objects", ", ".join(missed))
         starts = {name: start for name, start in starts.items() if name not in missed}
     if len(starts) < 2:
-        raise InputError(f"{folder}: fewer than two films show the release; they must begin before it")
+        raise InputError(
+            f"{folder}: fewer than two films show the release of the objects; give films that begin before it"
+        )
     # a track needs two films, so the sequence ends with the second longest film after the release
     shown = sorted(lengths[name] - start for name, start in starts.items())[-2]
     sequence = FilmedSequence(fps, max(1, math.ceil(min(rest - release + 1, shown))), starts)
     for name, start in starts.items():
-        log.info("%s: released at frame %.2f", name, start)
-    log.info("%d frames from release to rest, at %g a second", sequence.frames, fps)
+        log.info("%s: the objects are released at frame %.2f", name, start)
+    log.info("%d frames from release to rest, at %g frames per second", sequence.frames, fps)
     return _first_frames(folder, recordings, starts, options), sequence
 
 
 def _signal(path: Path) -> MotionSignal:
     frames = [image.numpy() for image, _ in read_recording(path, MOTION_SIDE)]
     if len(frames) < 2:
-        raise InputError(f"{path}: fewer than two frames of it can be read; give a film from before the release on, or "
+        raise InputError(f"{path}: has fewer than two readable frames; give a film that begins before the release, or "
                          "remove it")  # fmt: skip
     return motion_signal(frames)
 
@@ -83,7 +85,7 @@ def loudness(path: Path, fps: float) -> np.ndarray:
     Raises InputError for a recording without sound or with damaged sound.
     """
     if not path.is_file():
-        raise InputError(f"{path}: frames have no sound; use --sync motion")
+        raise InputError(f"{path}: is a folder of frames and has no sound; use --sync motion")
     with open_video(path) as file:
         if not file.streams.audio:
             raise InputError(f"{path}: has no sound; use --sync motion")
@@ -96,7 +98,7 @@ def loudness(path: Path, fps: float) -> np.ndarray:
         video, audio = (s.start_time or 0 for s in (file.streams.video[0], file.streams.audio[0]))
         late = float(audio * file.streams.audio[0].time_base - video * file.streams.video[0].time_base)
     if abs(late) > MAX_LATE:
-        raise InputError(f"{path}: its sound begins {late:.0f} s after its pictures; use --sync motion")
+        raise InputError(f"{path}: its sound begins {late:.0f} s after its first frame; use --sync motion")
     samples = np.concatenate(parts) if parts else np.zeros(0, np.float32)
     shift = round(late * SOUND_RATE)
     samples = np.pad(samples, (shift, 0)) if shift > 0 else samples[-shift:]

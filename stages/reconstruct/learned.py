@@ -54,7 +54,9 @@ def pi3_splat(photos: Photos, options: ReconstructOptions, steps: StepCache) -> 
 
 def _reconstruct(name: str, photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     if options.cameras is not None:
-        raise InputError(f"--cameras: --backend {name} estimates the cameras; use --backend classic with known ones")
+        raise InputError(
+            f"--cameras: --backend {name} estimates the cameras itself; use --backend classic for known cameras"
+        )
     device = pick_device(options.device)
     cropped = network_input.crop_photos(photos, options.resolution)
     images = network_input.make_batch(cropped, network_input.common_size(photos, options.resolution))
@@ -83,13 +85,16 @@ def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> 
         model = halve(model)
         room = memory.free(device)
         if memory.weights(model) > room:
-            raise InputError(f"the network needs {memory.weights(model) / 1e9:.1f} GB and the GPU has {room / 1e9:.1f} "
-                             "GB free; use --device cpu")  # fmt: skip
+            raise InputError(f"the network needs {memory.weights(model) / 1e9:.1f} GB of GPU memory, but "
+                             f"{room / 1e9:.1f} GB "
+                             "are free; use --device cpu")  # fmt: skip
         model = model.to(device)
     views, _, *size = images.shape
     at_once = memory.plan(config, views, tuple(size), splats, half, memory.free(device))
     need = memory.activations(config, views, tuple(size), at_once, splats, half) + memory.weights(model)
-    log.info("%d photos at %dx%d, about %.1f GB of memory, %d at once", views, *size[::-1], need / 1e9, at_once)
+    log.info(
+        "%d photos of %dx%d pixels, about %.1f GB of memory, %d photos at once", views, *size[::-1], need / 1e9, at_once
+    )
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
         output = model(images.to(device), at_once)
     geometry, raw = output if splats else (output, None)
@@ -108,7 +113,9 @@ def assemble(
     """Build the scene from the network's output for the cropped photos."""
     geometry = network.geometry
     confident = pointmaps.confident_pixels(geometry)
-    log.info("the network is confident in %.0f %% of the pixels", 100 * float(confident.float().mean()))
+    log.info(
+        "the network is confident of its prediction in %.0f %% of the pixels", 100 * float(confident.float().mean())
+    )
     cameras = pointmaps.cameras_from_pointmaps(geometry, confident, photos.names)
     cameras = replace(cameras, photos=network_input.photo_intrinsics(photos, cameras))
     trained, held_out = split_holdout(len(photos), options.holdout)

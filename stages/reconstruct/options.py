@@ -52,39 +52,45 @@ class ReconstructOptions:
 
     sequence: bool = option(
         False,
-        "PHOTOS has a video, or a folder of frames, for each of several fixed cameras: reconstruct "
-        "the moment at which the objects are released",
+        "PHOTOS contains a video, or a folder of frames, of each of several fixed cameras: reconstruct "
+        "the scene at the moment of release",
     )
-    sync: str = option("motion", "with --sequence, how films are aligned in time: " + " | ".join(SYNCHRONISATIONS))
+    sync: str = option(
+        "motion", "with --sequence: method that aligns the films in time: " + " | ".join(SYNCHRONISATIONS)
+    )
     offsets: str = option(
-        "", 'with --sequence, in place of --sync: the frame of each film at one moment, "A.mp4=0,B.mp4=3.33"'
+        "", 'with --sequence, instead of --sync: frame number of one common moment in each film: "A.mp4=0,B.mp4=3.33"'
     )
-    fps: float = option(50.0, "with --sequence: frames a second of folders of frames")
-    backend: str = option("classic", " | ".join(BACKENDS))
+    fps: float = option(50.0, "with --sequence: frame rate of folders of frames [frames/s]")
+    backend: str = option("classic", "method of reconstruction: " + " | ".join(BACKENDS))
     matcher: str = option(
         "sift",
-        "features matched between photos: "
+        "features that are matched between photos: "
         + " | ".join(FEATURE_EXTRACTORS)
-        + "; the learned ones match photos with little overlap",
+        + "; aliked-lightglue also matches photos with little overlap",
     )
     cameras: Path | None = option(None, "known cameras: transforms.json or a COLMAP model folder; default: estimated")
-    holdout: int = option(0, "hold out every N-th photo and report PSNR and SSIM on it; 0: none")
-    quality: str = option("normal", " | ".join(QUALITY_PRESETS))
+    holdout: int = option(0, "hold out every N-th photo from the fit and report PSNR and SSIM on these photos; 0: none")
+    quality: str = option("normal", "sizes and iterations of the reconstruction: " + " | ".join(QUALITY_PRESETS))
     resolution: int | None = option(None, "longest side to which photos are resized [px]; default: set by --quality")
     up: str = option(
-        "auto", "side of the photos that is up: auto (by the table or floor) | top | right | bottom | left"
+        "auto", "side of the photos that is up: auto (detected from the table or floor) | top | right | bottom | left"
     )
     scale_reference: str = option(
         "",
-        'a known length [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or '
-        '"distance=0.6" from the cameras to the point they look at',
+        'known distance that sets the scale [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or '
+        '"distance=0.6" from the cameras to the point that they look at',
     )
-    resume: bool = option(False, "continue an interrupted run after its last finished step")
+    resume: bool = option(
+        False, "continue an interrupted run with the same photos and options after its last finished step"
+    )
     weights: Path | None = option(
-        None, "weights of pi3 or pi3-splat (.safetensors, .pth); default: searched in $NGFF_WEIGHTS and ~/.cache/ngff"
+        None, "weights of pi3 or pi3-splat (.safetensors or .pth); default: searched in $NGFF_WEIGHTS and ~/.cache/ngff"
     )
-    download: bool = option(False, "download missing weights (CC BY-NC; needs the extra hub)")
-    iterations: int | None = option(None, "photometric optimisation steps, 0 for none; default: set by --quality")
+    download: bool = option(
+        False, "download missing weights of pi3 or pi3-splat (licence CC BY-NC; needs the extra hub)"
+    )
+    iterations: int | None = option(None, "steps of the photometric optimisation; 0: none; default: set by --quality")
     seed: int = seed_option()
     device: str = device_option()
 
@@ -93,13 +99,17 @@ class ReconstructOptions:
         if self.matcher not in FEATURE_EXTRACTORS:
             raise InputError(f"--matcher {self.matcher}: choose from {', '.join(FEATURE_EXTRACTORS)}")
         if self.backend == "classic" and (self.weights or self.download):
-            raise InputError("--weights and --download: only with --backend pi3 or pi3-splat; add it or drop them")
+            raise InputError("--weights and --download: only work with --backend pi3 or pi3-splat; add it or drop them")
         if self.backend != "classic" and self.matcher != "sift":
-            raise InputError(f"--matcher {self.matcher}: only with --backend classic, not {self.backend}; drop one")
+            raise InputError(
+                f"--matcher {self.matcher}: only works with --backend classic, not {self.backend}; drop one of the two"
+            )
         if self.quality not in QUALITY_PRESETS:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
         if self.up not in ("auto", *UP_SIDES):
-            raise InputError(f"--up {self.up}: choose auto, or the side of photos that is up: {', '.join(UP_SIDES)}")
+            raise InputError(
+                f"--up {self.up}: choose auto, or the side of the photos that is up: {', '.join(UP_SIDES)}"
+            )
         if self.holdout < 0 or self.holdout == 1:
             raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
         if self.resolution is not None and not 64 <= self.resolution <= 4096:
@@ -107,9 +117,9 @@ class ReconstructOptions:
         if self.sync not in SYNCHRONISATIONS:
             raise InputError(f"--sync {self.sync}: choose from {', '.join(SYNCHRONISATIONS)}")
         if not 0.1 <= self.fps <= 100_000:
-            raise InputError(f"--fps {self.fps:g}: give the frames a second, 0.1 to 100000")
+            raise InputError(f"--fps {self.fps:g}: give a frame rate from 0.1 to 100000 frames per second")
         if not self.sequence and (self.offsets or self.sync != "motion" or self.fps != type(self).fps):
-            raise InputError("--sync, --offsets and --fps: only with --sequence; add it or drop them")
+            raise InputError("--sync, --offsets and --fps: only work with --sequence; add it or drop them")
         parse_scale(self.scale_reference)
         if self.iterations is not None and not 0 <= self.iterations <= MAX_ITERATIONS:
             raise InputError(f"--iterations {self.iterations}: give 0 for none, or up to {MAX_ITERATIONS}")

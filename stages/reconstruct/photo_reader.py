@@ -69,11 +69,11 @@ def _from_folder(folder: Path, side: int, min_count: int) -> list[LoadedImage]:
     if len(best) < min_count:
         raise InputError(
             next(iter(unread.values())) if unread and not best else
-            f"{folder}: holds one photo{' that can be read' if unread else ''}; at least 2, better 10 or more from "
+            f"{folder}: contains one {'readable ' if unread else ''}photo; at least 2, better 10 or more, from "
             "around the scene, are needed"
         )  # fmt: skip
     if len(files) > MAX_PHOTOS:
-        log.info("%s: of %d photos the sharpest %d were taken, one of each span", folder, len(files), len(best))
+        log.info("%s: of %d photos the sharpest %d are used, one from each interval", folder, len(files), len(best))
     return best
 
 
@@ -86,9 +86,9 @@ def _files(folder: Path) -> list[Path]:
     if PHONE_SUFFIXES & foreign.keys():
         advice += ' (heif-convert, or sips on a Mac; a phone set to "most compatible" takes JPEG)'
     if foreign and not IMAGE_SUFFIXES & kinds.keys():
-        raise InputError(f"{folder}: holds {_counted(foreign)} photos, which cannot be read; {advice}")
+        raise InputError(f"{folder}: contains {_counted(foreign)} photos, which cannot be read; {advice}")
     if not IMAGE_SUFFIXES & kinds.keys() and (instead := next(filter(_is_source, inside), None)):
-        raise InputError(f"{folder}: holds no photos itself; give {instead}")
+        raise InputError(f"{folder}: contains no photos itself; give {instead}")
     files = list_photos(folder)
     if foreign:
         log.warning("%s: %s photos are left out; %s", folder, _counted(foreign), advice)
@@ -166,8 +166,8 @@ def _from_video(path: Path, side: int) -> list[LoadedImage]:
     spans = int(min(max(length * FRAMES_PER_SECOND, VIDEO_FRAMES[0]), VIDEO_FRAMES[1], len(times)))
     best = _sharpest(_frames(path, times, spans, side), spans)
     if len(best) < 2:
-        raise InputError(f"{path}: has {len(best)} frame; a video that moves around the scene is needed")
-    log.info("%s: took %d of %d frames, the sharpest of each span", path, len(best), len(times))
+        raise InputError(f"{path}: has {len(best)} frame; give a video whose camera moves around the scene")
+    log.info("%s: %d of %d frames are used, the sharpest of each interval", path, len(best), len(times))
     return best
 
 
@@ -188,7 +188,7 @@ def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[t
                 image, full = reduce_frame(frame, side)
                 yield span, LoadedImage(f"frame_{i:05d}", image, 0.0, full)
         except import_av(path).FFmpegError as error:
-            log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
+            log.warning("%s: is truncated or damaged (%s); the frames before the damage are used", path, error.strerror)
 
 
 def _sharpest(photos: Iterable[tuple[int, LoadedImage]], spans: int) -> list[LoadedImage]:

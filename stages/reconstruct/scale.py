@@ -29,7 +29,9 @@ class ScaleReference:
         """Raise InputError unless its photos are in `names`."""
         absent = [name for name in self.photos if name not in names]
         if absent:
-            raise InputError(f"--scale-reference: no camera found for {', '.join(absent)}; name photos that are used")
+            raise InputError(
+                f"--scale-reference: the scene has no camera of {', '.join(absent)}; name photos that were placed"
+            )
 
     def in_scene_units(self, cameras: Cameras, camera_distance: float) -> float:
         """The same length in the units of the cameras; `camera_distance` is their median distance from the focus.
@@ -44,7 +46,7 @@ class ScaleReference:
         first, second = centres(cameras.viewmats)[[cameras.names.index(name) for name in self.photos]]
         length = float((first - second).norm())
         if length < 0.05 * camera_distance:
-            raise InputError("--scale-reference: both photos were taken from nearly the same position; name others")
+            raise InputError("--scale-reference: both photos were taken from nearly the same position; name two others")
         return length
 
 
@@ -53,7 +55,8 @@ def parse_scale(text: str) -> ScaleReference | None:
     if not text:
         return None
     if "object" in text and "photos" not in text:
-        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, and `ngff segment` has "
+        raise InputError(f"--scale-reference {text!r}: objects are not known before segmentation, and `ngff "
+                         "segment` has "
                          f"the same option; here give {USAGE}")  # fmt: skip
     found = PATTERN.fullmatch(text.strip())
     try:

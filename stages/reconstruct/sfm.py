@@ -82,7 +82,7 @@ def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess
     if _is_stationary(pairs, photos):
         raise InputError(
             f"{photos.source}: the camera hardly moved between the photos; walk around the objects, or, if they are "
-            "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
+            "on a turntable, put it in front of a plain backdrop, so that only features on the objects are matched"
         )
     found = []
     for min_points in MIN_POINTS:
@@ -98,7 +98,7 @@ def _run_mapper(photos: Photos, database: Path, seed: int, second: SecondProcess
     best, models = max(found, key=lambda one: _quality(one[0]))
     model = _from_colmap(best, _drop_reasons(photos, pairs, best, models))
     log.info(
-        "placed %d of %d photos, %d points, mean reprojection error %.2f px",
+        "cameras of %d of %d photos, %d points, mean reprojection error %.2f px",
         len(model.cameras), len(photos), len(model.points), best.compute_mean_reprojection_error(),
     )  # fmt: skip
     return model
@@ -159,9 +159,10 @@ def _failure_reason(photos: int, pairs: int, matches: float) -> str:
             f"things (newspaper, a cloth) under and around the objects, use more light, and take more photos, {known}"
         )
     return (
-        f"{pairs} pairs of photos match, but no camera positions explain the matches; where a pattern repeats "
-        "(tiles, a checked cloth) its parts are confused: cover it, with newspaper for instance; where cameras are far "
-        "apart, as those of a few films, give known ones (--cameras)"
+        f"{pairs} pairs of photos match, but no camera positions explain the matches; if a pattern repeats "
+        "(tiles, a checked cloth), its parts are confused: cover it, for instance with newspaper; if the cameras "
+        "are far "
+        "apart, as in a set of few films, give known cameras (--cameras)"
     )
 
 
@@ -190,7 +191,7 @@ def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: list) 
         elif matches == 0:
             reasons[name] = "shows nothing that matches the other photos, or is blurred, dark or plain"
         else:
-            reasons[name] = f"has at most {matches} points in common with any placed photo, too few or too much in line"
+            reasons[name] = f"has at most {matches} points in common with any placed photo, too few or nearly collinear"
     return reasons
 
 
@@ -220,7 +221,8 @@ def triangulate(
     fitting = errors < matching.MAX_EPIPOLAR_ERROR * max(photos.size(0))
     if fitting.mean() < MIN_FITTING:
         raise InputError(
-            f"{photos.source}: the given cameras are {np.median(errors):.0f} px off what the photos show; check that "
+            f"{photos.source}: the median reprojection error of the given cameras is {np.median(errors):.0f} px; "
+            "check that "
             "they belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
         )
     model = pycolmap.Reconstruction()
@@ -233,8 +235,9 @@ def triangulate(
         run_colmap("triangulate", folder, database=str(database), photos=len(photos), seed=options.seed)
         done = pycolmap.Reconstruction(folder)
     if done.num_points3D() < 50:
-        raise InputError(f"{photos.source}: the photos overlap too little to find depth; {CAPTURE_ADVICE}")
-    log.info("%d points found with the given cameras, which fit %.0f %% of the matches to %.2f px", done.num_points3D(),
+        raise InputError(f"{photos.source}: the photos overlap too little to estimate depth; {CAPTURE_ADVICE}")
+    log.info("%d points triangulated with the given cameras, which fit %.0f %% of the matches, with a median "
+             "error of %.2f px", done.num_points3D(),
              100 * fitting.mean(), np.median(errors[fitting]))  # fmt: skip
     found = _from_colmap(done)
     return SparseModel(cameras, lenses, found.points, found.point_index, found.view_index)

@@ -75,7 +75,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
         steps.remove()
         raise
     except KeyboardInterrupt:
-        log.info("finished steps are kept next to %s; --resume continues from them", out)
+        log.info("results of finished steps are kept next to %s; --resume continues from them", out)
         raise
     steps.remove()
     report = _report(photos, made, steps, pick_device(options.device))
@@ -121,8 +121,8 @@ def _log_report(out: Path, report: Report) -> None:
         out, report.placed, report.photos, report.gaussians, report.learned.psnr, report.learned.ssim,
     )  # fmt: skip
     took = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in report.seconds.items())
-    log.info("%s; peak memory %.1f GB", took, report.memory)
+    log.info("%s; peak memory: %.1f GB", took, report.memory)
     if held := report.held_out:
         print(f"held-out photos: {held.photos}  PSNR {held.psnr:.2f} dB  SSIM {held.ssim:.3f}")
     for sentence in report.advice:
-        log.info("to improve it: %s", sentence)
+        log.info("to improve the scene: %s", sentence)

@@ -36,7 +36,7 @@ class StepCache:
         note = self.folder / "key"
         if not (resume and note.exists() and note.read_text() == key):
             if resume:
-                log.info("nothing to resume: there is no interrupted run with these photos, cameras and options")
+                log.info("--resume has no effect: there is no interrupted run with these photos, cameras and options")
             self.remove()
         self.folder.mkdir(exist_ok=True)
         note.write_text(key)
@@ -63,7 +63,7 @@ class StepCache:
         """
         path = self.folder / f"{name}.pt"
         if path.exists():
-            log.info("%s: result of the interrupted run", name)
+            log.info("%s: using the result of the interrupted run", name)
             torch.serialization.add_safe_globals(list(types))
             try:
                 return torch.load(path, weights_only=True)
@@ -78,7 +78,7 @@ class StepCache:
         """Path of the file that `write` writes, or that it wrote in the run that is resumed."""
         path = self.folder / name
         if path.exists():
-            log.info("%s: result of the interrupted run", path.stem)
+            log.info("%s: using the result of the interrupted run", path.stem)
             return path
         with replacing(path) as part:
             write(part)

@@ -64,9 +64,11 @@ def find_offsets(signals: dict[str, np.ndarray], rate: float = 1.0) -> dict[str,
     best = [max((c for pair, (_, c) in found.items() if i in pair), default=0.0) for i in range(len(names))]
     kept = [i for i in range(len(names)) if best[i] >= MIN_CORRELATION]
     for i in set(range(len(names))) - set(kept):
-        log.warning("%s: shows no motion in common with the other films and is left out; --offsets places it", names[i])
+        log.warning(
+            "%s: left out, as it shows no motion in common with the other films; give its time with --offsets", names[i]
+        )
     if len(kept) < 2:
-        raise InputError("the films show no common motion by which they could be synchronised; give --offsets")
+        raise InputError("the films show no common motion that could synchronise them; give their times with --offsets")
     rows = [(kept.index(i), kept.index(j), lag, c) for (i, j), (lag, c) in found.items() if i in kept and j in kept]
     offsets = _solve(len(kept), rows, PAIR_ERROR * rate) / rate
     return {names[i]: float(x) for i, x in zip(kept, offsets - offsets[0], strict=True)}
@@ -123,7 +125,7 @@ def find_motion(signals: dict[str, MotionSignal], offsets: dict[str, float]) -> 
         begins.append(min(max(start, first - 2.0), first + 1.0) - offset)
         ends.append(moves[-1] + 1 - offset)
     if not begins:
-        raise InputError("nothing moves in the films; give films that show the objects before and after the release")
+        raise InputError("nothing moves in the films; give films that show the objects before and after their release")
     return float(np.median(begins)), float(np.median(ends))
 
 
@@ -135,10 +137,10 @@ def parse_offsets(text: str, names: Sequence[str]) -> dict[str, float]:
         try:
             offsets[name] = float(value)
         except ValueError:
-            raise InputError(f"--offsets {text}: write NAME=FRAMES, ... such as {names[0]}=0,{names[1]}=3.33") from None
+            raise InputError(f"--offsets {text}: write NAME=FRAME,..., such as {names[0]}=0,{names[1]}=3.33") from None
     if wrong := [*(n for n in offsets if n not in names), *(n for n in names if n not in offsets)]:
         raise InputError(f"--offsets: {wrong[0]} is {'not a film' if wrong[0] in offsets else 'missing'}; the films "
                          f"are {', '.join(names)}")  # fmt: skip
     if not all(np.isfinite(list(offsets.values()))):
-        raise InputError(f"--offsets {text}: offsets must be finite")
+        raise InputError(f"--offsets {text}: offsets must be finite numbers")
     return offsets

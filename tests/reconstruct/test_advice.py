@@ -83,7 +83,7 @@ def test_scale_reference_between_two_cameras_or_to_the_focus():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("object=1 height=0.12", "only once segmented"),
+        ("object=1 height=0.12", "not known before segmentation"),
         ("distance=far", "in metres"),
         ("distance=-1", "more than 0"),
         ("photos=a.jpg distance=1", "in metres"),
@@ -97,7 +97,7 @@ def test_invalid_scale_references(text, words):
 
 def test_photos_of_a_scale_reference_must_have_distinct_cameras():
     cameras = ring(4)
-    with pytest.raises(InputError, match="no camera found for 9.jpg"):
+    with pytest.raises(InputError, match="the scene has no camera of 9.jpg"):
         parse_scale("photos=0.jpg,9.jpg distance=1").in_scene_units(cameras, 2.0)
     with pytest.raises(InputError, match="nearly the same position"):
         parse_scale("photos=0.jpg,0.jpg distance=1").in_scene_units(cameras, 2.0)

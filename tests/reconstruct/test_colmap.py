@@ -17,7 +17,7 @@ pycolmap = pytest.importorskip("pycolmap")
                                               ("os.kill(os.getpid(), 9)", "signal SIGKILL")])  # fmt: skip
 def test_a_process_that_ends_is_an_error_that_names_the_folder(tmp_path, monkeypatch, code, ending):
     monkeypatch.setattr(colmap, "WORKER", f"import os, sys; sys.stdin.readline(); {code}")
-    message = rf"{tmp_path}: COLMAP ended without a result \({ending}\); either memory or the disk is full"
+    message = rf"{tmp_path}: COLMAP ended without a result \({ending}\); memory or the disk is probably full"
     with colmap_process() as process, pytest.raises(InputError, match=message):
         run_colmap("map", tmp_path)
     assert process.poll() is not None

@@ -69,7 +69,7 @@ def surface_error(points: torch.Tensor) -> torch.Tensor:
     {"weights": Path("a")}, {"download": True}, {"backend": "pi3", "matcher": "aliked-lightglue"},
 ])  # fmt: skip
 def test_options_of_another_backend_are_refused(options):
-    with pytest.raises(InputError, match="only with --backend"):
+    with pytest.raises(InputError, match="only works? with --backend"):
         ReconstructOptions(**options)
 
 

@@ -119,7 +119,7 @@ def test_unreadable_photos_are_named_and_left_out(folder, caplog):
     for message in ("c.jpg: is truncated", "d.jpg: is empty", "e.jpg: is not an image", "f.png: is truncated"):
         assert message in caplog.text
     (folder / "b.jpg").unlink()
-    with pytest.raises(InputError, match="holds one photo that can be read"):
+    with pytest.raises(InputError, match="contains one readable photo"):
         read_photos(folder)
     (folder / "a.jpg").unlink()
     with pytest.raises(InputError, match="c.jpg: is truncated"):
@@ -151,11 +151,11 @@ def png_with_declared_size(width: int, height: int) -> bytes:
 def test_error_suggests_a_subfolder_or_video(tmp_path):
     (tmp_path / "day 1" / "images").mkdir(parents=True)
     Image.fromarray(random_image()).save(tmp_path / "day 1" / "images" / "a.png")
-    with pytest.raises(InputError, match="day 1: holds no photos itself; give .*images"):
+    with pytest.raises(InputError, match="day 1: contains no photos itself; give .*images"):
         read_photos(tmp_path / "day 1")
     (tmp_path / "films").mkdir()
     (tmp_path / "films" / "IMG 7.MOV").write_bytes(b"film")
-    with pytest.raises(InputError, match="films: holds no photos itself; give .*IMG 7.MOV"):
+    with pytest.raises(InputError, match="films: contains no photos itself; give .*IMG 7.MOV"):
         read_photos(tmp_path / "films")
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="none: contains no photos; supported formats"):
@@ -175,7 +175,7 @@ def test_appended_video_and_thumbnail_do_not_hide_truncation(folder):
 def test_formats_that_need_converting_are_named(tmp_path, caplog):
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     (tmp_path / "IMG_2.HEIC").write_bytes(b"heic")
-    with pytest.raises(InputError, match="holds 2 HEIC photos, which cannot be read; convert them to JPEG"):
+    with pytest.raises(InputError, match="contains 2 HEIC photos, which cannot be read; convert them to JPEG"):
         read_photos(tmp_path)
     for name in ("a.png", "b.png"):
         Image.fromarray(random_image()).save(tmp_path / name)
@@ -270,7 +270,7 @@ def test_truncated_video_is_refused(tmp_path):
 
 def test_video_with_one_frame_is_refused(tmp_path):
     write_video(tmp_path / "v.mp4", [0.0])
-    with pytest.raises(InputError, match="has 1 frame; a video that moves around"):
+    with pytest.raises(InputError, match="has 1 frame; give a video whose camera moves around"):
         read_photos(tmp_path / "v.mp4")
 
 
@@ -285,5 +285,5 @@ def test_other_files_in_the_folder_are_counted(folder, caplog):
 
 def test_one_photo_is_refused(tmp_path):
     Image.fromarray(random_image()).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match="holds one photo; at least 2"):
+    with pytest.raises(InputError, match="contains one photo; at least 2"):
         read_photos(tmp_path)

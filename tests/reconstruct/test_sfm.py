@@ -85,7 +85,7 @@ def test_known_cameras_are_kept_and_give_points_on_the_surfaces(tmp_path):
 def test_cameras_that_do_not_fit_the_photos_are_refused(tmp_path):
     cameras = arc(4, (240, 180), sweep=40.0)
     photos = as_photos(cameras, tmp_path)
-    with pytest.raises(InputError, match="the given cameras are .* px off"):
+    with pytest.raises(InputError, match="median reprojection error of the given cameras is .* px"):
         sfm.triangulate(photos, cameras[[3, 2, 1, 0]], LensDistortion(torch.zeros(4, 5)))
 
 

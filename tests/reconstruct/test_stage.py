@@ -195,7 +195,10 @@ def test_interrupted_run_resumes_from_finished_steps(small, small_preset, tmp_pa
 
 
 def test_input_error_leaves_no_files(small, small_preset, tmp_path):
-    for names, words in (("photo_00.png,x.png", "found for x.png"), ("photo_00.png,photo_00.png", "the same position")):
+    for names, words in (
+        ("photo_00.png,x.png", "no camera of x.png"),
+        ("photo_00.png,photo_00.png", "the same position"),
+    ):
         wrong = dataclasses.replace(small.options, scale_reference=f"photos={names} distance=1")
         with pytest.raises(InputError, match=words):
             run(small.folder / "images", tmp_path / "s.ply", wrong)
@@ -263,6 +266,6 @@ def test_scale_reference_gives_metres(small):
 
 def test_report_and_advice(small):
     report = small.report
-    assert "peak memory" in small.log and "to improve it: 4 photos are few" in small.log
+    assert "peak memory" in small.log and "to improve the scene: 4 photos are few" in small.log
     assert any("between photo_00.png and photo_03.png" in sentence for sentence in report.advice)
     assert report.placed == report.photos == 4 and report.held_out is None and report.memory > 0.1

@@ -91,7 +91,7 @@ def test_the_frames_at_the_release_are_the_photos(films, tmp_path):
 
 def test_a_film_of_one_frame_is_named(films, tmp_path):
     folder = write_frames(tmp_path / "cameras", {**films, "b": films["b"][:1]})
-    with pytest.raises(InputError, match="b: fewer than two frames of it can be read"):
+    with pytest.raises(InputError, match="b: has fewer than two readable frames"):
         read_sequence(folder, ReconstructOptions(sequence=True, offsets="a=0,b=0,c=0"))
 
 
@@ -104,7 +104,7 @@ def test_offsets_may_be_given(films, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("a=0", "b is missing"), ("a=0,b=1,z=2", "z is not a film"), ("a=0,b=x", "write NAME=FRAMES"), ("a,b", "write"),
+    [("a=0", "b is missing"), ("a=0,b=1,z=2", "z is not a film"), ("a=0,b=x", "write NAME=FRAME,"), ("a,b", "write"),
      ("a=0,b=nan", "finite")],
 )  # fmt: skip
 def test_wrong_offsets_are_refused(text, message):
@@ -118,7 +118,7 @@ def test_films_of_different_rates_are_refused(tmp_path):
             for _ in range(3):
                 video.append(torch.zeros(16, 16, 3))
     recordings = list_recordings(tmp_path)
-    with pytest.raises(InputError, match="same rate"):
+    with pytest.raises(InputError, match="same frame rate"):
         common_frame_rate(recordings, 50.0)
     assert [image.shape for image, _ in read_recording(recordings["a.mp4"], 8)] == [(8, 8, 3)] * 3
 
@@ -130,9 +130,9 @@ def test_one_film_is_too_few(tmp_path):
 
 
 def test_sequence_options_need_sequence():
-    with pytest.raises(InputError, match="only with --sequence"):
+    with pytest.raises(InputError, match="only work with --sequence"):
         ReconstructOptions(offsets="a=0,b=1")
-    with pytest.raises(InputError, match="only with --sequence"):
+    with pytest.raises(InputError, match="only work with --sequence"):
         ReconstructOptions(fps=30.0)
     with pytest.raises(InputError, match="--sync"):
         ReconstructOptions(sequence=True, sync="smell")
@@ -186,7 +186,7 @@ def test_damaged_and_very_late_sound_is_named(tmp_path):
     with pytest.raises(InputError, match="a.mkv: its sound cannot be read .*use --sync motion"):
         loudness(tmp_path / "a.mkv", 25)
     write_sound(tmp_path / "b.mov", "pcm_s16le", bytes(200), late=10_000.0)
-    with pytest.raises(InputError, match="b.mov: its sound begins 10000 s after its pictures; use --sync motion"):
+    with pytest.raises(InputError, match="b.mov: its sound begins 10000 s after its first frame; use --sync motion"):
         loudness(tmp_path / "b.mov", 25)
 
 

@@ -169,7 +169,7 @@ def test_films_of_no_camera_of_the_scene_are_refused(slide, tmp_path):
 def test_films_of_other_frame_rates_are_refused(slide, tmp_path):
     _, scene, films, problem = slide
     slow = {"camera00.mp4": still_film(tmp_path / "camera00.mp4", fps=25.0)}
-    with pytest.raises(InputError, match="the same rate"):
+    with pytest.raises(InputError, match="the same frame rate"):
         timing(problem.scene, scene, {**slow, "camera01.mp4": films[1]}, 0)
     filmed = replace(problem.scene, sequence=FilmedSequence(50.0, 9, {"camera01.mp4": 2.5}))
     with pytest.raises(InputError, match="camera00.mp4: has 25 frames a second, but the films of .* have 50"):

@@ -39,17 +39,18 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     Raises InputError for a scene without cameras, prompts without boxes, and boxes outside the first view.
     """
     if scene.cameras is None or not len(scene.cameras):
-        raise InputError("--boxes: the scene has no cameras; use one that `ngff reconstruct` wrote")
+        raise InputError("--boxes: the scene has no cameras; give a scene written by `ngff reconstruct`")
     size = scene.cameras.sizes[0].tolist()
     prompts = read_prompts(options.boxes, scene.cameras, options.undistorted)
     if prompts.boxes is None:
-        raise InputError(f"{options.boxes}: has points and no bbox; points are for --backend {NETWORKS}")
+        raise InputError(f"{options.boxes}: has points but no bbox; points only work with --backend {NETWORKS}")
     boxes_fraction = prompts.boxes / torch.tensor([*size, *size])
     for box, name in zip(boxes_fraction, prompts.names, strict=True):
         if not bool((box[2:] > box[:2]).all()):
             width, height = photo_of(scene.cameras, 0, options.undistorted)[1]
-            raise InputError(f"{options.boxes}: the box of {name} lies outside of the first view, which has "
-                             f'{width}x{height} pixels; for another image size, add "size": [w, h]')  # fmt: skip
+            raise InputError(f"{options.boxes}: the box of {name} is outside the first view, which has "
+                             f'{width}x{height} pixels; if the box is given for another image size, add "size": '
+                             '[w, h]')  # fmt: skip
     votes = torch.zeros(len(scene.gaussians), 1 + len(boxes_fraction))
     for view in tqdm(nearest_first(scene), desc="segmenting", unit="view", leave=False):
         footprint = ViewFootprint.of(scene, view)

@@ -41,7 +41,7 @@ def discover_objects(
             known = resize_logits((found[view] > 0)[None], masks.shape[2], masks.shape[1])[0] > 0.5
             masks = masks[(masks & known).sum((1, 2)) < MIN_KNOWN_FRACTION * masks.sum((1, 2))]
         masks = masks[: options.max_objects - count]
-        log.info("%s: %d new objects", tracker.scene.cameras.names[view], len(masks))
+        log.info("%s: %d new objects found", tracker.scene.cameras.names[view], len(masks))
         if len(masks):
             fresh = dict(tracker.labels(masks, row))
             number = match_labels(fresh, found, len(masks), count)

@@ -28,7 +28,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     Raises InputError for a scene without cameras, a folder without matching images, and wrong aspect ratios.
     """
     if scene.cameras is None:
-        raise InputError("--masks: the scene has no cameras; use one that `ngff reconstruct` wrote")
+        raise InputError("--masks: the scene has no cameras; give a scene written by `ngff reconstruct`")
     files, names = match_files(options.masks, scene.cameras.names, "label image", "--masks"), read_names(options.masks)
     bar, columns = tqdm(files.items(), unit="mask"), {0: 0}
     votes = collect_votes(scene, ((view, _columns(_labels(scene, view, file, options), columns)) for view, file in bar))
@@ -44,7 +44,9 @@ def _columns(labels: Int[Tensor, "h w"], columns: dict[int, int]) -> Int[Tensor,
     for number in numbers.tolist():
         columns.setdefault(number, len(columns))
     if len(columns) > MAX_LABELS:
-        raise InputError(f"--masks: the label images have more than {MAX_LABELS} different numbers; each is an object")
+        raise InputError(
+            f"--masks: the label images have more than {MAX_LABELS} different numbers; give one number per object"
+        )
     return torch.tensor([columns[number] for number in numbers.tolist()])[index]
 
 

@@ -28,11 +28,14 @@ class ObjectScaleReference:
         means = scene.gaussians.means[scene.gaussians.object_id == self.object].double()
         if len(means) < 2:
             have = ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
-            raise InputError(f"--scale-reference: there is no object {self.object} in the scene; found were {have}")
+            raise InputError(f"--scale-reference: there is no object {self.object} in the scene; objects found: {have}")
         sides = means.quantile(1 - OUTLIER_FRACTION, dim=0) - means.quantile(OUTLIER_FRACTION, dim=0)
         units = float(sides[2] if self.side == "height" else sides.max())
         if units <= 0:
-            raise InputError(f"--scale-reference: object {self.object} has no {self.side} in the scene; name another")
+            raise InputError(
+                f"--scale-reference: object {self.object} has no measurable {self.side} in the "
+                "scene; name another object"
+            )
         source = f"--scale-reference object={self.object} {self.side}={self.metres:g}"
         return replace(scene, scale={"metres_per_unit": self.metres / units, "source": source})
 

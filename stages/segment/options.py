@@ -14,15 +14,15 @@ from stages.segment.object_scale import parse_object_scale
 
 # a backend takes (scene, SegmentOptions) and returns the scene with labels and objects
 BACKENDS = {
-    "learned": Backend("stages.segment.learned:segment", "objects by a network trained on simulated clutter"),
+    "learned": Backend("stages.segment.learned:segment", "find objects with a network trained on simulated clutter"),
     "geometric": Backend(
-        "stages.segment.geometric:segment", "objects on the supporting plane, by position, colour and shape"
+        "stages.segment.geometric:segment", "group the Gaussians on the supporting plane by position, colour and shape"
     ),
-    "masks": Backend("stages.segment.masks:segment", "label images of the photos (--masks), voted over all views"),
-    "points": Backend("stages.segment.points:segment", "the objects at points in photos (--points), by the network"),
-    "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
+    "masks": Backend("stages.segment.masks:segment", "vote over label images of the photos (--masks)"),
+    "points": Backend("stages.segment.points:segment", "find the objects at points in photos (--points)"),
+    "boxes": Backend("stages.segment.boxes:segment", "cut out objects in boxes in the first view (--boxes)"),
     "sam2": Backend(
-        "stages.segment.prompted:segment", "SAM 2.1: boxes, points or automatic masks, propagated through the photos",
+        "stages.segment.prompted:segment", "propagate boxes, points or automatic masks through the photos with SAM 2.1",
         find_weights="stages.core.models.sam2.weights:find", network="stages.core.models.sam2.weights:load_segmenter",
         package="transformers", extra="sam2",
     ),
@@ -37,54 +37,60 @@ class SegmentOptions:
     backend: str = option("learned", describe(BACKENDS))
     masks: Path | None = option(
         None,
-        "folder of label images named as the photos: 0 background, 1... objects; 255 is ignored "
-        "where its names.json does not name it",
+        "folder of label images named like the photos: 0 background, 1... objects; 255 is ignored "
+        "unless its names.json gives it a name",
     )
     boxes: Path | None = option(
-        None, f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points"
+        None, f"prompts.json with names and boxes of objects in the first photo [px]; for {NETWORKS} also points"
     )
     points: tuple[str, ...] = option(
         (),
-        'a point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; repeatable; '
-        "points of one name are on one object",
+        'point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; repeatable; '
+        "points with the same name mark one object",
     )
     photos: Path | None = photos_option(NETWORKS)
     undistorted: bool = option(
-        False, "masks, boxes and photos are of undistorted views; default: of the photos as taken"
+        False, "masks, boxes, points and photos belong to undistorted views; default: to the photos as taken"
     )
     weights: Path | None = option(
         None,
-        f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
-        "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours",
+        f"for {NETWORKS}: file or folder of the network's weights, by default its folder in "
+        "$NGFF_WEIGHTS or ~/.cache/ngff; for learned: segmenter.safetensors, by default the one in the package",
     )
     download: bool = download_option(NETWORKS)
-    names: str = option("", 'object names: "1=duck,2=bowl"')
+    names: str = option("", 'names of the objects by number: "1=duck,2=bowl"')
     max_objects: int = option(GroupingOptions.max_objects, "maximum number of objects")
     min_size: float = option(
-        GroupingOptions.min_size, "ignore objects whose longest side is below this fraction of the camera distance"
+        GroupingOptions.min_size,
+        "ignore objects whose longest side is shorter than this fraction of the camera distance",
     )
     detail: float = option(
-        GroupingOptions.detail, "backend geometric: merge threshold of regions, 0 to 2; lower values give more objects"
+        GroupingOptions.detail,
+        "for backend geometric: threshold for merging regions, 0 to 2; lower values give more objects",
     )
-    scale_reference: str = option("", 'a length measured on an object [m]: "object=1 height=0.12" (or length=)')
+    scale_reference: str = option(
+        "",
+        'measured height or length of an object that sets the scale [m]: "object=1 height=0.12" or "object=1 '
+        'length=0.2"',
+    )
     seed: int = seed_option()
     device: str = device_option()
 
     def __post_init__(self):
         check_types(self)
         if (self.masks is not None) + (self.boxes is not None) + bool(self.points) > 1:
-            raise InputError("--masks, --boxes and --points: give one of them")
+            raise InputError("--masks, --boxes and --points: cannot be combined; give only one of them")
         if self._is_network and (self.masks is not None or self.points):
-            raise InputError(f"--backend {self.backend} makes masks itself; give no --masks or --points, or leave "
-                             "--backend out")  # fmt: skip
+            raise InputError(f"--backend {self.backend} generates masks itself; drop --masks or --points, or drop "
+                             "--backend")  # fmt: skip
         if not self._is_network and (self.photos or self.download):
             raise InputError(f"--photos and --download only work with --backend {NETWORKS}; add it or drop them")
         if not self._is_network and self.weights and self.backend != "learned":
             raise InputError(f"--weights only works with --backend {NETWORKS} or learned; add it or drop --weights")
         if self.chosen != self.backend != type(self).backend:
-            raise InputError(f"--{self.chosen} selects a backend of its own; drop it or --backend {self.backend}")
+            raise InputError(f"--{self.chosen} selects its own backend; drop it or --backend {self.backend}")
         if self.detail != type(self).detail and self.chosen != "geometric":
-            raise InputError("--detail: only with --backend geometric; add it or drop --detail")
+            raise InputError("--detail: only works with --backend geometric; add it or drop --detail")
         if self.undistorted and not (self.masks or self.boxes or self.points or self.photos):
             raise InputError("--undistorted: only applies to --masks, --boxes, --points, --photos; add one or drop it")
         if self.max_objects < 1:

@@ -46,8 +46,9 @@ def parse_points(texts: tuple[str, ...]) -> list[PointPrompt]:
         try:
             x, y = float(found["x"]), float(found["y"])
         except (TypeError, ValueError) as error:
-            raise InputError(f'--points {quote(repr(text))}: write "view=IMG.jpg xy=310,220 name=duck"; view is by '
-                             "default the first photo") from error  # fmt: skip
+            raise InputError(f'--points {quote(repr(text))}: write "view=IMG.jpg xy=310,220 name=duck"; the '
+                             'default view is '
+                             "the first photo") from error  # fmt: skip
         out.append(PointPrompt(found["view"] or "", (x, y), found["name"] or f"object_{len(out) + 1}", text))
     return out
 
@@ -59,7 +60,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     at any point.
     """
     if scene.cameras is None or not len(scene.cameras):
-        raise InputError("--points: the scene has no cameras; use one that `ngff reconstruct` wrote")
+        raise InputError("--points: the scene has no cameras; give a scene written by `ngff reconstruct`")
     prompts = parse_points(options.points)
     names = list(dict.fromkeys(p.name for p in prompts))
     clicks = [Click(_surface(scene, p, options.undistorted), names.index(p.name) + 1, p.text) for p in prompts]
@@ -76,13 +77,14 @@ def _surface(scene: Scene, prompt: PointPrompt, undistorted: bool) -> Float[Tens
     views = {Path(name).stem: i for i, name in enumerate(cameras.names)} | {n: i for i, n in enumerate(cameras.names)}
     view = views.get(prompt.view) if prompt.view else 0
     if view is None:
-        raise InputError(f"--points {quote(repr(prompt.text))}: the scene has no photo of this name; its first is "
+        raise InputError(f"--points {quote(repr(prompt.text))}: the scene has no photo of this name; its first "
+                         "photo is "
                          f"{cameras.names[0]}")  # fmt: skip
     size = photo_of(cameras, view, undistorted)[1]
     x, y = Undistortion.of(cameras, view, size, undistorted).points(torch.tensor([prompt.xy]))[0].tolist()
     width, height = cameras.sizes[view].tolist()
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError(f"--points {quote(repr(prompt.text))}: is outside of the photo, which has {size[0]}x{size[1]} "
+        raise InputError(f"--points {quote(repr(prompt.text))}: is outside the photo, which has {size[0]}x{size[1]} "
                          "pixels")  # fmt: skip
     K, viewmat = cameras.Ks[view], cameras.viewmats[view]
     depth = rasterise(scene.gaussians, viewmat[None], K[None], width, height).depth[0].reshape(height, width)

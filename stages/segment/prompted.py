@@ -33,15 +33,22 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """
     name = options.backend
     if scene.cameras is None or not len(scene.cameras):
-        raise InputError(f"--backend {name}: the scene has no cameras; use one that `ngff reconstruct` wrote")
+        raise InputError(f"--backend {name}: the scene has no cameras; give a scene written by `ngff reconstruct`")
     images = view_images(scene, options.photos, options.undistorted)
     boxes = options.boxes
     prompts = read_prompts(boxes, scene.cameras, options.undistorted) if boxes is not None else None
     if prompts is not None and images.views[0] != 0:
-        raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
+        raise InputError(
+            f"{options.photos}: does not contain {scene.cameras.names[0]}, the photo to which --boxes refers; add it"
+        )
     load_network: Callable[[Path | None, bool, str], PromptableSegmenter] = load(BACKENDS[name].network)
     network = load_network(options.weights, options.download, pick_device(options.device))
-    log.info("%s: %d %s", name, len(images), "photos" if options.photos else "rendered views of the scene: no --photos")
+    log.info(
+        "%s: %d %s",
+        name,
+        len(images),
+        "photos" if options.photos else "rendered views of the scene, without --photos",
+    )
     tracker = MaskTracker(network, scene, images)
     if prompts is not None:
         votes = collect_votes(scene, tracker.labels(point_prompts(prompts, scene)))

@@ -38,7 +38,9 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     log_objects(labelled)
     log.info("%s: %d objects", out, len(labelled.objects))
     if not labelled.objects:
-        log.warning("%s: no objects were found; try --masks, or --min-size %g", scene, options.min_size / 2)
+        log.warning(
+            "%s: no objects were found; try --masks, or a smaller --min-size such as %g", scene, options.min_size / 2
+        )
 
 
 def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
@@ -46,7 +48,7 @@ def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
     have = {o.id for o in scene.objects}
     for number in options.renamed:
         if number not in have:
-            raise InputError(f"--names: there is no object {number}; found were {_listed(scene)}")
+            raise InputError(f"--names: there is no object {number}; objects found: {_listed(scene)}")
     names = {number: text(name, "--names") for number, name in options.renamed.items()}
     return replace(scene, objects=tuple(replace(o, name=names.get(o.id, o.name)) for o in scene.objects))
 

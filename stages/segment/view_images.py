@@ -70,14 +70,15 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder; {option} takes a folder of {what}s named as the photos")
+        raise InputError(f"{folder}: is not a folder; {option} takes a folder of {what}s named like the photos")
     images = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
     named = {i: images.get(Path(name).stem, images.get(name)) for i, name in enumerate(names)}
     found = {i: file for i, file in named.items() if file}
     if not found:
         raise InputError(
-            f"{folder}: no {what} is named as a photo of the scene, such as {Path(names[0]).stem}.png"
-            if names else f"{folder}: the scene has no names of photos"
+            f"{folder}: contains no {what} named like a photo of the scene, such as {Path(names[0]).stem}.png"
+            if names else f"{folder}: the scene does not state the names of its photos; give a scene written by "
+                          "`ngff reconstruct`"
         )  # fmt: skip
     if len(found) < len(names):
         log.info("%s: %ss for %d of %d photos", folder, what, len(found), len(names))

@@ -141,8 +141,8 @@ def test_small_pieces_and_small_holes_are_removed():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [('{"bbox": [[200, 10, 300, 50]], "text": ["duck"]}', "of duck lies outside of the first view, which has 160x160"),
-     ('{"center_point": [[5, 5]], "text": ["duck"]}', "points are for --backend sam2"),
+    [('{"bbox": [[200, 10, 300, 50]], "text": ["duck"]}', "of duck is outside the first view, which has 160x160"),
+     ('{"center_point": [[5, 5]], "text": ["duck"]}', "points only work with --backend sam2"),
      ('{"bbox": [[20, 10, 20, 50]], "text": ["duck"]}', "a box has no area")],
 )  # fmt: skip
 def test_invalid_boxes_are_refused(tmp_path, text, message):

@@ -26,16 +26,17 @@ def test_names_by_number():
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"masks": SOME, "boxes": SOME}, "give one of them"), ({"masks": SOME, "points": ("a",)}, "give one of them"),
-    ({"boxes": SOME, "points": ("a",)}, "give one of them"),
-    ({"backend": "sam2", "masks": SOME}, "--backend sam2 makes masks itself"),
-    ({"backend": "sam2", "points": ("a",)}, "--backend sam2 makes masks itself"),
+    ({"masks": SOME, "boxes": SOME}, "give only one of them"),
+    ({"masks": SOME, "points": ("a",)}, "give only one of them"),
+    ({"boxes": SOME, "points": ("a",)}, "give only one of them"),
+    ({"backend": "sam2", "masks": SOME}, "--backend sam2 generates masks itself"),
+    ({"backend": "sam2", "points": ("a",)}, "--backend sam2 generates masks itself"),
     ({"photos": SOME}, "--photos and --download only work with --backend sam2"),
     ({"download": True}, "--photos and --download only work"),
     ({"backend": "geometric", "weights": SOME}, "--weights only works with --backend sam2 or learned"),
     ({"undistorted": True}, "--undistorted: only applies to"),
-    ({"detail": 0.3}, "--detail: only with --backend geometric"),
-    ({"backend": "geometric", "detail": 0.3, "points": ("a",)}, "--points selects a backend of its own"),
+    ({"detail": 0.3}, "--detail: only works with --backend geometric"),
+    ({"backend": "geometric", "detail": 0.3, "points": ("a",)}, "--points selects its own backend"),
 ])  # fmt: skip
 def test_options_that_exclude_each_other(options, message):
     with pytest.raises(InputError, match=message):

@@ -85,8 +85,8 @@ def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog, mo
 
 
 @pytest.mark.parametrize("text, reason", [
-    ("view=99.jpg xy=3,4", "has no photo of this name; its first is 00.jpg"),
-    ("xy=500,20", "outside of the photo, which has 160x160 pixels"),
+    ("view=99.jpg xy=3,4", "has no photo of this name; its first photo is 00.jpg"),
+    ("xy=500,20", "outside the photo, which has 160x160 pixels"),
 ])  # fmt: skip
 def test_points_that_are_in_no_photo_are_refused(text, reason):
     with pytest.raises(InputError, match=reason):
@@ -100,9 +100,9 @@ def test_other_forms_are_refused(text):
 
 
 def test_one_way_of_marking_at_a_time(tmp_path):
-    with pytest.raises(InputError, match="give one of them"):
+    with pytest.raises(InputError, match="give only one of them"):
         SegmentOptions(points=("xy=1,2",), masks=tmp_path)
-    with pytest.raises(InputError, match="give no --masks or --points"):
+    with pytest.raises(InputError, match="drop --masks or --points"):
         SegmentOptions(points=("xy=1,2",), backend="sam2")
     with pytest.raises(InputError, match="has no cameras"):
         segment(three_apart(cameras=False), SegmentOptions(points=("xy=1,2",)))

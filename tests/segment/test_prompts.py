@@ -105,11 +105,11 @@ def test_numbers_of_labels_have_columns_in_the_order_in_which_they_appear(monkey
 
 def test_images_belong_to_photos_by_their_names_without_suffix(tmp_path, caplog):
     caplog.set_level("INFO")
-    with pytest.raises(InputError, match="no mask is named as a photo of the scene, such as a.png"):
+    with pytest.raises(InputError, match="contains no mask named like a photo of the scene, such as a.png"):
         match_files(tmp_path, ("x/a.jpg", "b.jpg"), "mask", "--masks")
     with pytest.raises(InputError, match="absent: is not a folder; --masks takes a folder of masks"):
         match_files(tmp_path / "absent", ("a.jpg",), "mask", "--masks")
-    with pytest.raises(InputError, match="the scene has no names of photos"):
+    with pytest.raises(InputError, match="the scene does not state the names of its photos"):
         match_files(tmp_path, (), "mask", "--masks")
     for name in ("b.PNG", "c.jpg", "a.txt"):
         (tmp_path / name).touch()
@@ -172,8 +172,8 @@ def test_a_measured_length_gives_the_scale(two_balls, side, units):
     scaled = ObjectScaleReference(3, side, 1.5).applied(scene)
     assert scaled.metres_per_unit == pytest.approx(1.5 / units, rel=0.03)
     assert scaled.scale["source"] == f"--scale-reference object=3 {side}=1.5"
-    with pytest.raises(InputError, match="there is no object 2 in the scene; found were 1 .red ball., 2"):
+    with pytest.raises(InputError, match="there is no object 2 in the scene; objects found: 1 .red ball., 2"):
         ObjectScaleReference(2, side, 1.0).applied(scene)
     flat = replace(scene, gaussians=replace(scene.gaussians, means=torch.zeros_like(means)))
-    with pytest.raises(InputError, match=f"object 3 has no {side} in the scene"):
+    with pytest.raises(InputError, match=f"object 3 has no measurable {side} in the scene"):
         ObjectScaleReference(3, side, 1.0).applied(flat)

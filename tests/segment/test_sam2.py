@@ -75,7 +75,7 @@ def test_photos_may_be_missing_except_the_prompted_one(scene_file, truth, weight
     options = SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights)
     run(scene_file, tmp_path / "out.ply", options)
     (photos / "00.png").unlink()
-    with pytest.raises(InputError, match="lacks 00.jpg, the photo that --boxes is about"):
+    with pytest.raises(InputError, match="does not contain 00.jpg, the photo to which --boxes refers"):
         run(scene_file, tmp_path / "other.ply", options)
 
 
@@ -137,7 +137,7 @@ def test_invalid_prompts_are_refused(truth, tmp_path, data, message):
 
 def test_boxes_backend_refuses_points(scene_file, tmp_path):
     boxes = prompts_file(tmp_path / "p.json", **POINTS)
-    with pytest.raises(InputError, match="points are for --backend sam2"):
+    with pytest.raises(InputError, match="points only work with --backend sam2"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions(boxes=boxes))
 
 

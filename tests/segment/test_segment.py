@@ -212,7 +212,7 @@ def test_boxes_give_named_objects(scene_file, truth, tmp_path):
     ("prepare", "message"),
     [
         (lambda p: {"masks": p / "nowhere"}, "is not a folder"),
-        (lambda p: (p / "m").mkdir() or {"masks": p / "m"}, "no label image is named as a photo"),
+        (lambda p: (p / "m").mkdir() or {"masks": p / "m"}, "contains no label image named like a photo"),
         (lambda p: {"boxes": p / "nowhere.json"}, "no such file"),
         (lambda p: (p / "b.json").write_text("{}") and {"boxes": p / "b.json"}, "is not a prompts file"),
         (lambda p: (p / "b.json").write_text('{"bbox": [[5, 5, 1, 1]], "text": ["x"]}') and {"boxes": p / "b.json"},
@@ -239,7 +239,7 @@ def test_masks_of_another_aspect_ratio_are_refused(scene_file, truth, tmp_path):
      ({"scale_reference": "duck=0.1"}, "object=1 height=0.12"),
      ({"scale_reference": "object=1 height=0"}, "more than 0"), ({"max_objects": 0}, "max-objects"),
      ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them"),
-     ({"backend": "sam2", "masks": "a"}, "makes masks itself"),
+     ({"backend": "sam2", "masks": "a"}, "generates masks itself"),
      ({"backend": "geometric", "weights": "a"}, "with --backend sam2")],
 )  # fmt: skip
 def test_invalid_options_are_refused(wrong, message):
@@ -248,7 +248,7 @@ def test_invalid_options_are_refused(wrong, message):
 
 
 def test_masks_need_cameras_and_objects_without_gaussians_are_logged(truth, tmp_path, caplog):
-    with pytest.raises(InputError, match="--masks: the scene has no cameras; use one that `ngff reconstruct` wrote"):
+    with pytest.raises(InputError, match="--masks: the scene has no cameras; give a scene .* `ngff reconstruct`"):
         masks.segment(replace(truth, cameras=None), SegmentOptions(masks=tmp_path))
     caplog.set_level(logging.INFO)
     log_objects(replace(truth, objects=(*truth.objects, SceneObject(9, "ghost"))))

@@ -22,9 +22,9 @@ def test_files_are_matched_by_name_without_suffix(tmp_path, caplog):
 
 
 def test_a_folder_without_a_matching_file_is_an_error(tmp_path):
-    with pytest.raises(InputError, match="is not a folder; --masks takes a folder of masks named as the photos"):
+    with pytest.raises(InputError, match="is not a folder; --masks takes a folder of masks named like the photos"):
         match_files(tmp_path / "none", ("a.jpg",), "mask", "--masks")
-    with pytest.raises(InputError, match="no mask is named as a photo of the scene, such as a.png"):
+    with pytest.raises(InputError, match="contains no mask named like a photo of the scene, such as a.png"):
         match_files(tmp_path, ("a.jpg",), "mask", "--masks")
-    with pytest.raises(InputError, match="the scene has no names of photos"):
+    with pytest.raises(InputError, match="the scene does not state the names of its photos"):
         match_files(tmp_path, (), "mask", "--masks")

@@ -40,10 +40,11 @@ def complete(
     side = RESTORED_SIDE if upscaler else model.side
     crop = crop_object(scene, own, side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
     if crop is None:
-        log.info("  %d  %s: unchanged: no photo shows enough of it", number, name)
+        log.info("  %d  %s: unchanged, as no photo shows enough of the object", number, name)
         return empty_like(own)
     if not TRAINED_ELEVATIONS[0] <= crop.elevation <= TRAINED_ELEVATIONS[1]:
-        log.info("  %d  %s: seen from %.0f degrees above in %s; outside the %.0f to %.0f that DiffSplat was trained on",
+        log.info("  %d  %s: seen from %.0f degrees above in %s, outside DiffSplat's training range of %.0f to "
+                 "%.0f degrees",
                  number, name, crop.elevation, crop.name, *TRAINED_ELEVATIONS)  # fmt: skip
     prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
     if upscaler:
@@ -59,7 +60,7 @@ def complete(
     )
     if registration is None:
         log.info(
-            "  %d  %s: unchanged: the object generated from %s has too few opaque Gaussians", number, name, crop.name
+            "  %d  %s: unchanged, as the object generated from %s has too few opaque Gaussians", number, name, crop.name
         )
         return empty_like(own)
     added, verdict = place_whole(generated, registration, own, observed, MIN_FIT)

@@ -54,7 +54,11 @@ def complete(
     crop = crop_object(scene, own, SIDE, options.photos) if enough and options.matcher != "none" else None
     found = best_asset(own, options, crop) if enough else None
     if found is None:
-        log.info("  %d  %s: unchanged: too few Gaussians to compare with the library", number, scene.name_of(number))
+        log.info(
+            "  %d  %s: unchanged, as it has too few Gaussians to be compared with the library",
+            number,
+            scene.name_of(number),
+        )
         return empty_like(own)
     asset, whole, registration = found
     added, verdict = place_whole(whole, registration, own, observed, MIN_FIT)
@@ -78,9 +82,9 @@ def place_whole(
     placed = transformed(whole, registration.similarity.to(whole.means.device))
     free = _free_fraction(placed, observed)
     fits = registration.fit >= min_fit and free <= MAX_FREE_FRACTION
-    verdict = "added" if fits else f"unchanged: {min_fit} and at most {MAX_FREE_FRACTION:.0%} are needed"
+    verdict = "added" if fits else f"unchanged, as it needs {min_fit} and at most {MAX_FREE_FRACTION:.0%}"
     added = unseen_gaussians(own, placed, int(own.object_id[0])) if fits else empty_like(own)
-    return added, f"has a fit of {registration.fit:.2f}, {100 * free:.0f} % of it is in observed free space; {verdict}"
+    return added, f"has a fit of {registration.fit:.2f}, {100 * free:.0f} % of it in observed free space; {verdict}"
 
 
 @lru_cache(maxsize=1)
@@ -92,19 +96,26 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder; --library takes whole objects, such as `ngff-lab objects` writes")
+        raise InputError(
+            f"{folder}: is not a folder; --library takes a folder of complete objects, as written by `ngff-lab objects`"
+        )
     found = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".ply" and not p.name.startswith("."))
     files = {p.stem: p for p in found if p.parent == folder}
     # the last file of each folder, by path
     files.update({p.relative_to(folder).parts[0]: p for p in found if p.parent != folder})
     if not files:
-        raise InputError(f"{folder}: holds no .ply; --library takes whole objects, such as `ngff-lab objects` writes")
+        raise InputError(
+            f"{folder}: contains no .ply; --library takes a folder of complete objects, as written "
+            "by `ngff-lab objects`"
+        )
     out = {}
     for name, path in files.items():
         g = read_scene(path).gaussians
         g = g[(g.opacities > SURFACE_OPACITY) & g.scales.isfinite().all(1)]
         if len(g) < MIN_ASSET_GAUSSIANS:
-            raise InputError(f"{path}: {len(g)} opaque Gaussians are too few for an object; remove it from the library")
+            raise InputError(
+                f"{path}: has {len(g)} opaque Gaussians, too few for an object; remove the file from the library"
+            )
         out[name] = g, RegistrationCloud.of(g.to(device))
     return out
 

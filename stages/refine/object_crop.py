@@ -77,7 +77,7 @@ def _files(photos: Path, scene: Scene) -> dict[int, Path]:
     names = scene.cameras.names if scene.cameras is not None else ()
     files = {i: found[Path(name).stem] for i, name in enumerate(names) if Path(name).stem in found}
     if not files:
-        raise InputError(f"{photos}: holds no photo of the scene" + (f", such as {names[0]}" if names else ""))
+        raise InputError(f"{photos}: contains no photo of the scene" + (f", such as {names[0]}" if names else ""))
     return files
 
 

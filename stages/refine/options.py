@@ -12,9 +12,9 @@ from stages.core.options import check_types, device_option, download_option, opt
 # a completer takes (scene, object id, ObservedSpace, Support | None, RefineOptions) and returns Gaussians to add
 BACKENDS = {
     "close": Backend("stages.refine.hull_completion:complete", "fill the unseen part of the object's convex hull"),
-    "library": Backend("stages.refine.library:complete", "the registered object of --library that fits best"),
+    "library": Backend("stages.refine.library:complete", "add unseen sides of the best match in --library"),
     "diffsplat": Backend(
-        "stages.refine.diffsplat:complete", "DiffSplat: a generated object, registered to what was seen",
+        "stages.refine.diffsplat:complete", "generate the object with DiffSplat and register it to its visible part",
         find_weights="stages.refine.diffsplat:weights_file", package="diffusers", extra="diffsplat",
     ),
     "none": Backend("stages.refine.hull_completion:no_completion", "add nothing to objects"),
@@ -22,9 +22,9 @@ BACKENDS = {
 GENERATORS = with_weights(BACKENDS)
 # an upscaler takes RefineOptions and returns a network whose `restore(image, prompt, seed)` adds detail, or None
 UPSCALERS = {
-    "none": Backend("stages.refine.upscale:no_upscaler", "the photo's pixels"),
+    "none": Backend("stages.refine.upscale:no_upscaler", "use the photo's pixels"),
     "osediff": Backend(
-        "stages.refine.upscale:osediff", "detail added by OSEDiff at 768 pixels",
+        "stages.refine.upscale:osediff", "add detail with OSEDiff at 768 pixels",
         find_weights="stages.refine.upscale:weights_file", package="diffusers", extra="diffsplat",
     ),
 }  # fmt: skip
@@ -38,25 +38,31 @@ class RefineOptions:
     """Parameters of refinement; raises InputError for values outside their range and for conflicting ones."""
 
     completer: str = option("close", describe(BACKENDS))
-    library: Path | None = option(None, "folder of complete objects (.ply); the best match replaces a partial object")
+    library: Path | None = option(None, "folder of complete objects (.ply); the best match completes a partial object")
     photos: Path | None = photos_option(GENERATORS)
-    weights: Path | None = option(None, f"for {GENERATORS}: folder of its weights; default: searched in $NGFF_WEIGHTS")
+    weights: Path | None = option(None, f"for {GENERATORS}: folder of the weights; default: searched in $NGFF_WEIGHTS")
     download: bool = download_option(GENERATORS)
-    upscale: str = option("none", f"for {GENERATORS}, super-resolution of the object's image; {describe(UPSCALERS)}")
-    matcher: str = option("none", f"to register whole objects, by a photo and renderings: {' | '.join(MATCHERS)}")
-    keep_raw: bool = option(False, "also keep the K objects unrefined, with ids K+1 to 2K")
-    outliers: float = option(3.0, "outlier threshold [robust standard deviations]; 0 keeps all Gaussians")
-    background: bool = option(True, "fill the table under and behind objects")
-    resolution: int = option(48, "voxels along an object's longest side when unseen surfaces are closed")
+    upscale: str = option("none", f"for {GENERATORS}: super-resolution of the object's image; {describe(UPSCALERS)}")
+    matcher: str = option("none", f"feature matcher to register complete objects with photos: {' | '.join(MATCHERS)}")
+    keep_raw: bool = option(False, "also keep the K unrefined objects, with ids K+1 to 2K")
+    outliers: float = option(
+        3.0, "threshold for removing outlying Gaussians [robust standard deviations]; 0: keep all Gaussians"
+    )
+    background: bool = option(True, "fill the gaps in the table under and behind objects")
+    resolution: int = option(48, "for completer close: number of voxels along an object's longest side")
     seed: int = seed_option()
     device: str = device_option()
 
     def __post_init__(self):
         check_types(self)
         if self.completer == "library" and self.library is None:
-            raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
+            raise InputError(
+                "--completer library: needs --library, a folder of complete objects as written by `ngff-lab objects`"
+            )
         if self.library is not None and self.chosen != "library":
-            raise InputError(f"--library {self.library}: not with --completer {self.completer}; drop one of them")
+            raise InputError(
+                f"--library {self.library}: does not work with --completer {self.completer}; drop one of them"
+            )
         if not self._is_generator and (self.photos or self.weights or self.download):
             raise InputError(
                 f"--photos, --weights and --download only work with --completer {GENERATORS}; add it or drop them"
@@ -70,9 +76,12 @@ class RefineOptions:
         if self.matcher != "none" and self.chosen not in WHOLE_OBJECTS:
             raise InputError(f"--matcher: only works with --library or --completer {GENERATORS}; add it or drop it")
         if not 0 <= self.outliers < 1000:
-            raise InputError(f"--outliers {self.outliers}: give 0 to keep all, or robust deviations such as 3")
+            raise InputError(
+                f"--outliers {self.outliers}: give 0 to keep all Gaussians, or a number of robust "
+                "standard deviations below 1000, such as 3"
+            )
         if not 8 <= self.resolution <= 96:
-            raise InputError(f"--resolution {self.resolution}: must be 8 to 96 cells")
+            raise InputError(f"--resolution {self.resolution}: must be 8 to 96 voxels")
 
     @property
     def _is_generator(self) -> bool:

@@ -111,7 +111,7 @@ def test_transformed_gaussians_render_equally_from_a_transformed_camera():
 
 def test_invalid_libraries_are_refused(seen, tmp_path):
     write_scene(tmp_path / "labelled.ply", seen)
-    for folder, message in ((tmp_path / "none", "is not a folder"), (tmp_path / "empty", "holds no .ply")):
+    for folder, message in ((tmp_path / "none", "is not a folder"), (tmp_path / "empty", "contains no .ply")):
         (tmp_path / "empty").mkdir(exist_ok=True)
         with pytest.raises(InputError, match=message):
             run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions(library=folder))
@@ -130,7 +130,7 @@ def test_suffixes_have_any_case_and_hidden_files_do_not_count(tmp_path):
 
 def test_provenance_records_the_library(seen, folder, tmp_path):
     write_scene(tmp_path / "labelled.ply", replace(seen, gaussians=concatenate([seen.gaussians[::4]])))
-    with pytest.raises(InputError, match="--library.*: not with --completer none"):
+    with pytest.raises(InputError, match="--library.*: does not work with --completer none"):
         RefineOptions(completer="none", library=folder)
     options = RefineOptions(library=folder, background=False)
     run(tmp_path / "labelled.ply", tmp_path / "out.ply", options)

@@ -127,7 +127,7 @@ def test_steep_and_cropped_views_are_not_chosen(scene, photos):
 
 def test_photos_of_another_scene_are_refused(scene, tmp_path):
     write_png(tmp_path / "other.png", torch.zeros(4, 4, 3))
-    with pytest.raises(InputError, match="holds no photo of the scene, such as 0.jpg"):
+    with pytest.raises(InputError, match="contains no photo of the scene, such as 0.jpg"):
         crop_object(scene, opaque_gaussians(scene, 1), SIDE, tmp_path)
 
 

@@ -81,7 +81,7 @@ def _engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompt
     elif uneven:
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
     elif reasons and (options.live or held) and not (lasting and sideways):
-        unlike = "is slower than live sessions" if options.live else "does not hold objects of photos at rest"
+        unlike = "is too slow for live sessions" if options.live else "does not hold objects of photos at rest"
         engine = "ngff" if lasting else "rigid"
         reason = f"{(lasting or reasons)[0].text}, and --engine mpm {unlike}"
     elif reasons:
@@ -192,9 +192,10 @@ def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) ->
         parts = choices[o.id].several
         held = any(part.pinned for part in parts)
         if parts:
-            log.warning("object %d (%s): --engine %s has one material for an object and takes the average of its parts"
-                        "%s; with --engine mpm each part has its own", o.id, o.name, options.engine,
-                        ", and pins it as a whole" * held)  # fmt: skip
+            log.warning("object %d (%s): --engine %s supports one material per object and uses the average of "
+                        "the object's parts"
+                        "%s; with --engine mpm each part has its own material", o.id, o.name, options.engine,
+                        ", and holds the whole object fixed" * held)  # fmt: skip
         prompts = replace(prompts, pinned=prompts.pinned | {o.id}) if held else prompts
     return prompts
 

@@ -104,7 +104,9 @@ def rollout(
     _warn_extrapolation(initial, model)
     if options.contact == "solved":
         if not isinstance(model, ForceField):
-            raise InputError(f"--contact solved: not for weights of {card['model']}, only for those of the engine ngff")
+            raise InputError(
+                f"--contact solved: only works with weights of the engine ngff, not with weights of {card['model']}"
+            )
         floors = _floor_heights(per_object, setup, options)
         surfaces = body_surfaces(scene, initial, units, setup.lift, floors, options.seed)
         model = SolvedForceField(model, surfaces.to(device))
@@ -112,10 +114,11 @@ def rollout(
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))
     if steps > MAX_STEPS:
-        raise InputError(f"a frame of {options.dt:g} s takes {steps} steps of the learned field, as the objects are "
-                         f"about {TYPICAL_SIZE / units.length:.2g} scene units large; give a smaller --dt or another "
+        raise InputError(f"--dt {options.dt:g}: a frame takes {steps} steps of the learned field, as the objects are "
+                         f"about {TYPICAL_SIZE / units.length:.2g} scene units large; give a smaller --dt or use "
+                         "another "
                          "--engine")  # fmt: skip
-    log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
+    log.info("%s (weights %s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
     awake = _starts_awake(initial, units, setup) | starts_released(scene, options)
@@ -125,7 +128,9 @@ def rollout(
         rest = HeldBodies(initial, surfaces, seen, awake, setup.on_floor_as_seen)
     else:
         rest = SleepState(initial.to(device), awake, setup.on_floor)
-    log.info("%d of %d objects are at rest and stay fixed until touched", int(rest.asleep.sum()), len(ids))
+    log.info(
+        "%d of %d objects are at rest and stay fixed until something touches them", int(rest.asleep.sum()), len(ids)
+    )
     model_units = FieldUnits(
         units.length, units.scale, units.time, units.mass, tuple(units.origin.tolist()), units.gravity, steps,
         card["sha256"], options.friction,
@@ -257,8 +262,8 @@ def _model_stiffness(o: SceneObject, E: float, ratio: float) -> float:
     """Young's modulus [Pa], raised so that the body is at least as stiff as the softest bodies in training."""
     bounded = max(E, MIN_STIFFNESS / ratio)
     if bounded / 2 > E:
-        log.warning("object %d (%s): %.2g Pa (at this size) is softer than bodies of its thickness in training; "
-                    "taking %.2g Pa, compare with --engine mpm", o.id, o.name, E, bounded)  # fmt: skip
+        log.warning("object %d (%s): %.2g Pa (at this size) is softer than training objects of its thickness; "
+                    "%.2g Pa is used instead; compare with --engine mpm", o.id, o.name, E, bounded)  # fmt: skip
     return bounded
 
 
@@ -305,17 +310,17 @@ def _warn_extrapolation(initial: InitialConditions, model: Dynamics) -> None:
     hidden = ~initial.valid[0, ..., None]
     long = (points.masked_fill(hidden, -torch.inf).amax(1) - points.masked_fill(hidden, torch.inf).amin(1)).amax(1)
     if float(long.max() / long.min()) > SIZE_RANGE[1] / SIZE_RANGE[0]:
-        log.warning("the largest object is %.1f times as long as the smallest, at most %.1f times in training; "
+        log.warning("the largest object is %.1f times as long as the smallest, but at most %.1f times in training; "
                     "compare with --engine mpm", long.max() / long.min(), SIZE_RANGE[1] / SIZE_RANGE[0])  # fmt: skip
     thin = min(float(box_sides(p[valid])[0]) for p, valid in zip(points, initial.valid[0], strict=True))
     if thin < MIN_THICKNESS / 1.5:
         log.warning("an object is %.2g times thinner than any in training and may sink into others; "
                     "compare with --engine mpm", MIN_THICKNESS / thin)  # fmt: skip
     if len(long) > MAX_OBJECTS:
-        log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm",
+        log.warning("the scene has %d objects, but the model was tested with up to %d; compare with --engine mpm",
                     len(long), MAX_OBJECTS)  # fmt: skip
     if float(initial.velocity.norm(dim=-1).max()) > MAX_SPEED:
-        log.warning("an object starts faster than any in training; compare with --engine mpm")
+        log.warning("an object has a higher initial speed than any in training; compare with --engine mpm")
     for name in sorted({"mass", "E", "friction", "gravity"} - model.inputs):
         log.warning("this model does not take the %s into account", name)
 

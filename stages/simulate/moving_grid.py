@@ -98,7 +98,7 @@ class MovingGrid:
             room *= 0.8
         if self._nodes(box) > self._max_nodes:
             self._fixed = True
-            log.warning("%s moves too far from the other objects for one grid, and is stopped at %s; use a coarser "
+            log.warning("%s moves too far away from the other objects for one grid and is stopped at %s; use a coarser "
                         "--quality, or simulate it alone", self._farthest(), self._ends())  # fmt: skip
             return
         self.box = box

@@ -56,7 +56,7 @@ def rollout(
     setup = set_up_scene(scene, prompts, options, refinement=2 if fine else 1)
     setup.warn_of_lifted(scene)
     if held_as_seen(scene, options):
-        log.warning("--engine mpm does not hold objects of photos at rest: all of them move from the start")
+        log.warning("--engine mpm does not hold objects of photos at rest: all objects may move from the start")
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
     box = mpm.Box(tuple(unit * v for v in setup.box.low), tuple(unit * v for v in setup.box.high))
@@ -119,7 +119,7 @@ def _changed(
         models = [{part.material.model for part in m[o.id].parts} for m in (materials, setup.materials)]
         if models[0] != models[1]:
             raise InputError(f"object {o.id} ({o.name}) cannot become {materials[o.id].name} during a simulation with "
-                             "--engine mpm: its material model is another one")  # fmt: skip
+                             "--engine mpm: its current material has a different material model")  # fmt: skip
     return _particles(scene, replace(setup, materials=materials), prompts, options, level)
 
 
@@ -140,7 +140,7 @@ def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) ->
 
 def _divergence(o: SceneObject, time: float) -> InputError:
     return InputError(
-        f"object {o.id} ({o.name}) left the domain or its motion ceased to be finite at {time:.2f} s; use a finer "
+        f"object {o.id} ({o.name}) left the domain or its motion diverged at {time:.2f} s; use a finer "
         "--quality, a softer --material, a wider --box if there is one, or a smaller --velocity or --force"
     )
 
@@ -176,7 +176,7 @@ def _particles(
             if m.loss > 1.05 * loss:
                 message += f"; loss factor reduced from {m.loss:.2g} to {loss:.2g}"
             if not len(rows):
-                message = f"object {o.id} ({o.name}): nothing of it is in the part of {part.name}"
+                message = f"object {o.id} ({o.name}): no particles are in its part of {part.name}"
             log.info("%s", message)
         velocity[mine] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
     E, density, nu, viscosity, friction, model = columns[:, :6].unbind(1)

@@ -215,7 +215,7 @@ class PlausibilityMonitor:
         table = table_of(self._scene, self._options) if far.any() else None
         for row in [] if table is None else np.flatnonzero((table.beyond(self._com[-1]) > 0) & far):
             o = self._scene.objects[row]
-            log.warning("object %d (%s) is beyond the edge of the table, where --engine %s continues the floor; "
+            log.warning("object %d (%s) is beyond the edge of the table, where --engine %s extends the floor; "
                         "--engine rigid does not", o.id, o.name, self._options.engine)  # fmt: skip
 
     def warn(self, result: dict) -> None:
@@ -228,7 +228,7 @@ class PlausibilityMonitor:
             share = depth / min(self._height(a), self._height(b))
             if share > BOUNDS["penetration"]:
                 one, into = self._scene.objects[a], self._scene.objects[b]
-                log.warning("--lift puts object %d (%s) and object %d (%s) into each other by %.0f %% of the smaller "
+                log.warning("--lift makes object %d (%s) and object %d (%s) overlap by %.0f %% of the smaller "
                             "height", one.id, one.name, into.id, into.name, 100 * share)  # fmt: skip
         self._warn_of_edges()
         for row, o in enumerate(self._scene.objects):
@@ -238,14 +238,14 @@ class PlausibilityMonitor:
                 log.warning("%s sinks into %s by %.0f %% of the smaller height; compare with --engine %s",
                             what, self._partner[row], 100 * found["penetration"], other)  # fmt: skip
             if found["creep"] > BOUNDS["creep"]:
-                log.warning("%s does not come to rest: it creeps by %.1f %% of its size a second; compare with "
+                log.warning("%s does not come to rest but creeps by %.1f %% of its size per second; compare with "
                             "--engine %s", what, 100 * found["creep"], other)  # fmt: skip
             elastic = not MODELS[materials[o.id].material.model].plastic
             if found["spread"] > BOUNDS["spread"] and elastic:
                 log.warning("%s changes its size by %.0f %%; compare with --engine %s, or give a stiffer --material",
                             what, 100 * found["spread"], other)  # fmt: skip
         if result["energy_gain"] > BOUNDS["energy_gain"]:
-            log.warning("the objects gain %.0f %% of the energy that was converted; compare with --engine %s",
+            log.warning("the objects gain energy: %.0f %% of the energy that was converted; compare with --engine %s",
                         100 * result["energy_gain"], other)  # fmt: skip
 
 

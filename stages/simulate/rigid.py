@@ -73,7 +73,7 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     bodies = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
-    log.info("%d bodies, %d of them not convex, substep %.3g s (%d per frame)", len(bodies),
+    log.info("%d bodies, %d of them non-convex, substep %.3g s (%d per frame)", len(bodies),
              sum(not b.shape.convex for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
     return _states(world, keypoints, setup, prompts, options)
 
@@ -119,7 +119,7 @@ def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: Sim
     for row, (o, (shape, ground)) in enumerate(zip(scene.objects, shapes, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
         if ground < floor:
-            log.info("object %d (%s) is below the floor; it stands at %.3g", o.id, o.name, ground)
+            log.info("object %d (%s) is below the floor; the floor under it is placed at %.3g", o.id, o.name, ground)
         shape = replace(shape, com=shape.com + shift, inertia=shape.inertia + shape.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
         mass = m.density * shape.volume * unit**3
@@ -135,7 +135,8 @@ def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: Sim
             log.warning("object %d (%s): %s yields or flows, but rigid bodies keep their shape; use --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
         elif sag(m, height, options.gravity) > MAX_RIGID_SAG:
-            log.warning("object %d (%s): %s yields by %.0f %% under its own weight, but rigid bodies keep their shape; "
+            log.warning("object %d (%s): %s is compressed by %.0f %% by its own weight, but rigid bodies keep "
+                        "their shape; "
                         "use --engine ngff or mpm", o.id, o.name, choice.name,
                         100 * sag(m, height, options.gravity))  # fmt: skip
     return bodies

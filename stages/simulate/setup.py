@@ -101,7 +101,8 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
     if bool(outside.any()):
         row = int(bodies.body[outside.nonzero()[0, 0]])
         o = scene.objects[row]
-        raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside; it spans "
+        raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside the box; enlarge it or "
+                         "move the object, which spans "
                          f"{_extent(x[bodies.body == row])}")  # fmt: skip
     at_rest = x - (lift + floor_offset)[bodies.body]
     bodies = replace(bodies, x=at_rest)
@@ -126,7 +127,10 @@ def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, botto
     if scene.floor is not None:
         return scene.floor
     floor = float(bottom.min())
-    log.info("the scene has no floor; one is placed under the lowest object, at %.3g (--floor changes it)", floor)
+    log.info(
+        "the scene has no floor; a floor is placed under the lowest object, at height %.3g (change it with --floor)",
+        floor,
+    )
     return floor
 
 
@@ -134,7 +138,7 @@ def parse_box(text: str) -> Box:
     """Parse the domain of --box, "x0,y0,z0,x1,y1,z1": lower and upper corner. Raises InputError if malformed."""
     where, parts = f"--box {text!r}", text.split(",")
     if len(parts) != 6:
-        raise InputError(f"{where}: write x0,y0,z0,x1,y1,z1")
+        raise InputError(f"{where}: needs six numbers; write x0,y0,z0,x1,y1,z1")
     box = Box(vector(",".join(parts[:3]), where), vector(",".join(parts[3:]), where))
     if any(low >= high for low, high in zip(box.low, box.high, strict=True)):
         raise InputError(f"{where}: the first corner must be below the second in x, y and z")
@@ -168,7 +172,7 @@ def _default_box(x: Float[Tensor, "p 3"], floor: float, h: float) -> Box:
 def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOptions) -> None:
     """Raise InputError if points [scene units] are not finite or too far away for a trajectory file."""
     if not bool((points.abs() < LARGEST).all()):
-        raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity or "
+        raise InputError(f"the motion diverged at {frame * options.dt:.2f} s; use a smaller --velocity or "
                          "--force, or another --engine")  # fmt: skip
 
 
@@ -196,5 +200,5 @@ def held_as_seen(scene: Scene, options: SimulateOptions) -> bool:
 def tell_of_unseen_sides(scene: Scene, path: Path) -> None:
     """Log that sides not visible in any photo are missing, unless `ngff refine` has added them."""
     if from_photos(scene) and "refine" not in scene.commands:
-        log.info("%s: the sides that no photo shows are missing, so that objects may be too light and hollow; "
+        log.info("%s: sides that no photo shows are missing, so that objects may be hollow and too light; "
                  "`ngff refine` adds them", path)  # fmt: skip

@@ -86,19 +86,24 @@ def run(
     monitor.warn(measured)
     size = float((keypoints.rest.amax(0) - keypoints.rest.amin(0)).max())
     if max_displacement < 0.02 * size and not prompts:
-        log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)
+        log.info(
+            "all objects stay at rest (maximum displacement: %.2g); make them move with --lift 0.3 or a --force",
+            max_displacement,
+        )
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
 
 
 def _tell_of_idle_prompts(prompts: forces.ForcePrompts, scene: Scene, options: SimulateOptions) -> None:
     """Warn of prompts without effect: those that contradict others, or begin after the end of the simulation."""
     for id in sorted(prompts.pinned & prompts.velocity.keys()):
-        log.warning("object %d (%s) is held by --pin, so that its --velocity has no effect", id, scene.name_of(id))
+        log.warning(
+            "object %d (%s) is held fixed by --pin, so that its --velocity has no effect", id, scene.name_of(id)
+        )
     end = (options.steps - 1) * options.dt
     if late := [f for f in prompts.forces if f.start >= end]:
         name = scene.name_of(late[0].object_id)
-        log.warning("%d of %d forces begin after the end of the simulation at %g s, such as one on %s at %g s; "
-                    "give more --steps", len(late), len(prompts.forces), end, name, late[0].start)  # fmt: skip
+        log.warning("%d of %d forces begin after the end of the simulation at %g s, such as a force on %s at %g s; "
+                    "increase --steps", len(late), len(prompts.forces), end, name, late[0].start)  # fmt: skip
 
 
 def with_recorded(options: SimulateOptions, given: Collection[str] = ()) -> SimulateOptions:
@@ -136,13 +141,14 @@ def with_objects(scene: Scene, path: Path, seed: int = 0, device: str = "auto") 
     if present:
         return replace(scene, objects=tuple(present))
     if scene.gaussians.object_id.any():
-        raise InputError(f"{path}: its objects are points, or too far from the origin for their size, and cannot be "
+        raise InputError(f"{path}: its objects are single points, or too far from the origin for their size, and "
+                         "cannot be "
                          "simulated; label it with `ngff segment`, or move the scene to the origin")  # fmt: skip
     from stages.core.models.segmenter.segment import segment_by_network  # noqa: PLC0415 -- only unlabelled scenes need it
 
     grouped = segment_by_network(scene, seed=seed, device=pick_device(device))
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
-        raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
+        raise InputError(f"{path}: no objects were found in the scene; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)
-    log.info("%s has no objects yet; found %d: %s", path, len(grouped.objects), names)
+    log.info("%s has no labelled objects; %d objects were found: %s", path, len(grouped.objects), names)
     return grouped

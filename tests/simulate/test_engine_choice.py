@@ -148,7 +148,8 @@ def test_a_part_that_is_pinned_holds_the_whole_of_an_object_but_in_mpm(tmp_path,
     assert for_engine(prompts, scene, replace(options, engine="mpm")) == prompts and not caplog.text
     assert for_engine(prompts, scene, replace(options, engine="rigid")).pinned == {1, 7}
     first, second = caplog.messages
-    assert "object 1 (red ball): --engine rigid has one material" in first and "and pins it as a whole" in first
+    assert "object 1 (red ball): --engine rigid supports one material" in first
+    assert "and holds the whole object fixed" in first
     assert "object 2" in second and "pins" not in second
     assert for_engine(prompts, scene, SimulateOptions(engine="rigid")) == prompts
 

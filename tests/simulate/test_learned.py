@@ -216,8 +216,9 @@ class WithoutGravity:
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"count": 7}, "7 objects; the model was tested with up to 6"), ({"speed": 9.0}, "faster than any in training"),
-    ({"speed": 0.7 * MAX_SPEED, "along": (1.0, 1.0, -1.0)}, "faster than any in training"),
+    ({"count": 7}, "7 objects, but the model was tested with up to 6"),
+    ({"speed": 9.0}, "a higher initial speed than any in training"),
+    ({"speed": 0.7 * MAX_SPEED, "along": (1.0, 1.0, -1.0)}, "a higher initial speed than any in training"),
     ({"flat": 0.05}, "thinner than any in training"), ({"grow": 8.0}, "times as long as the smallest"),
     ({}, "does not take the gravity"),
 ])  # fmt: skip
@@ -280,7 +281,7 @@ def test_an_ode_solver_can_replace_the_step_of_the_model(two_balls, tmp_path):
 
 
 def test_mpm_takes_no_ode_solver():
-    with pytest.raises(InputError, match="only for learned engines"):
+    with pytest.raises(InputError, match="only works with learned engines"):
         SimulateOptions(engine="mpm", integrator="rk4")
     with pytest.raises(InputError, match="choose from step, euler"):
         SimulateOptions(integrator="midpoint")

@@ -292,7 +292,7 @@ def test_socket_needs_token_and_origin(server):
 
 
 def test_a_port_that_is_taken_and_an_absent_package_are_named(server, monkeypatch):
-    with pytest.raises(InputError, match=f"--port {server.port}: cannot listen on it .*; choose another"):
+    with pytest.raises(InputError, match=f"--port {server.port}: the port cannot be opened .*; choose another"):
         LiveServer("<p>page</p>", server.port)
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     with pytest.raises(MissingPackage, match="--live needs the package websockets: `pip install websockets`"):

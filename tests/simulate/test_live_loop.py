@@ -139,7 +139,7 @@ def test_a_failing_engine_pauses_with_a_note_and_a_new_start_helps(play):
 def test_engines_that_tell_no_masses_are_refused(play):
     played = play()
     state = played.live.session.state
-    with pytest.raises(InputError, match="--live: this engine does not tell the masses of the objects"):
+    with pytest.raises(InputError, match="--live: this engine does not report the masses of the objects"):
         played.live.session.observe(replace(state, mass=None))
     assert played.live.session.state is state
 

@@ -115,7 +115,7 @@ def test_overlap_by_a_lift_is_warned_of_and_not_counted(scene, caplog):
         expected = 0.15 if height > 0.06 else 0.0
         assert monitor.result()["objects"]["1"]["penetration"] == pytest.approx(expected, abs=0.03)
     monitor.warn(monitor.result())
-    (text,) = re.findall(r"object 1 .lower. and object 2 .upper. into each other by (\d+) %", caplog.text)
+    (text,) = re.findall(r"object 1 .lower. and object 2 .upper. overlap by (\d+) %", caplog.text)
     assert int(text) == pytest.approx(30, abs=3)
 
 
@@ -249,8 +249,8 @@ def test_a_body_that_has_turned_is_measured_where_it_is(scene):
 
 
 @pytest.mark.parametrize(("measure", "bound", "text"), [
-    ("penetration", 0.03, "sinks into the floor by 4 %"), ("creep", 0.01, "it creeps by 1.1 % of its size a second"),
-    ("spread", 0.1, "changes its size by 11 %"), ("energy_gain", 0.05, "gain 6 % of the energy"),
+    ("penetration", 0.03, "sinks into the floor by 4 %"), ("creep", 0.01, "creeps by 1.1 % of its size per second"),
+    ("spread", 0.1, "changes its size by 11 %"), ("energy_gain", 0.05, "gain energy: 6 % of the energy"),
 ])  # fmt: skip
 def test_warnings_begin_above_the_bounds(scene, caplog, measure, bound, text):
     caplog.set_level(logging.WARNING)

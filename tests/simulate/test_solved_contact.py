@@ -111,7 +111,7 @@ def test_agrees_with_theory(device, name):
 def test_is_the_default_for_stiff_bodies():
     with pytest.raises(InputError, match="--contact hard: choose from auto, learned, solved"):
         SimulateOptions(contact="hard")
-    with pytest.raises(InputError, match="--contact solved: only for --engine ngff, not for rigid"):
+    with pytest.raises(InputError, match="--contact solved: only works with --engine ngff, not with --engine rigid"):
         SimulateOptions(engine="rigid", contact="solved")
     scene = two_balls_scene()
 

@@ -65,12 +65,12 @@ def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.
         print(server.url, flush=True)
         if scene.options.browser:
             webbrowser.open(server.url)
-        log.info("listening on this machine only; Ctrl-C ends and writes %s", out)
+        log.info("the page is accessible from this machine only; Ctrl-C ends the session and writes %s", out)
         live = _Live(scene, setup, server, writer, out)
         while not stop.is_set():
             live.turn()
         writer.store_prompts(live.session.record)
-    log.info("%s: %d frames; the same motion again: ngff simulate SCENE.ply --forces %s", out, writer.frames, out)
+    log.info("%s: %d frames; to repeat this motion, run ngff simulate SCENE.ply --forces %s", out, writer.frames, out)
 
 
 class _Live:

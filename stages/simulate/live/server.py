@@ -60,7 +60,9 @@ class LiveServer:
         try:
             self._listener = socket.create_server((HOST, port))
         except OSError as error:
-            raise InputError(f"--port {port}: cannot listen on it ({error.strerror}); choose another") from error
+            raise InputError(
+                f"--port {port}: the port cannot be opened ({error.strerror}); choose another one"
+            ) from error
         self.port = self._listener.getsockname()[1]
         self.url = f"http://{HOST}:{self.port}/{self._token}/"
         self._clients: list[Client] = []

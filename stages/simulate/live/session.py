@@ -78,7 +78,9 @@ class Session:
     def observe(self, state: FrameState) -> None:
         """Take the present frame. Raises InputError if the engine does not provide the masses of the objects."""
         if state.mass is None:
-            raise InputError("--live: this engine does not tell the masses of the objects (FrameState.mass)")
+            raise InputError(
+                "--live: this engine does not report the masses of the objects (FrameState.mass); use another --engine"
+            )
         self._before = None if self.state is None else self.state
         self.state = state
 

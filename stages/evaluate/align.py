@@ -79,7 +79,8 @@ def check_same_reference_frame(prediction: ReferenceFrame, truth: ReferenceFrame
         return
     if distance > limit:
         raise InputError(
-            f"{prediction.file}: has another frame of reference than {truth.file} ({what} are {float(distance):.3g} "
+            f"{prediction.file}: has a different frame of reference than {truth.file} ({what} are "
+            f"{float(distance):.3g} "
             "units apart); add --align to align them first"
         )
 
@@ -115,7 +116,9 @@ def _from_cameras(predicted: Cameras, true: Cameras) -> Similarity:
         ends = c[:, None] + _rms_radius(c) * axes
         points.append(torch.cat([c, ends.flatten(0, 1)]))
     if not float(_rms_radius(centres(predicted.viewmats))) > 0:
-        raise InputError("--align: the shared cameras have one and the same position, so the scale is undetermined")
+        raise InputError(
+            "--align: all shared cameras have the same position, so that the scale is undetermined; share more photos"
+        )
     return _single(umeyama(*points))
 
 

@@ -71,7 +71,9 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
             caption = f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}"
             pictures.append(Pictures(caption, {"prediction": predicted, "truth": true}))
     if options.frames is not None and len(scores) < options.frames:
-        raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
+        raise InputError(
+            f"--frames {options.frames}: both files have only {len(scores)} frames; give {len(scores)} or fewer"
+        )
     if options.frames is not None:
         notes.append(f"only the first {options.frames} frames were compared, as given by --frames")
     values = torch.tensor(scores, dtype=torch.float64)
@@ -100,8 +102,8 @@ def _check_rates(prediction: Path, truth: Path) -> list[str]:
         predicted, true = video_info(prediction)[1], video_info(truth)[1]
         if abs(predicted - true) > 1e-3 * true:
             raise InputError(
-                f"{prediction}: {predicted:g} frames a second, but {truth} has {true:g}; "
-                f"render one of them again with `ngff render --fps {true:g}`"
+                f"{prediction}: has {predicted:g} frames per second, but {truth} has {true:g}; "
+                f"render one of the two again with `ngff render --fps {true:g}`"
             )
         return []
     if prediction.is_dir() and truth.is_dir():
@@ -124,7 +126,7 @@ def _check_sizes(prediction: Path, truth: Path, predicted: Tensor, true: Tensor)
     if predicted.shape != true.shape:
         (h, w), (h2, w2) = predicted.shape[:2], true.shape[:2]
         raise InputError(
-            f"{prediction}: images of {w}x{h}, but {truth} has {w2}x{h2}; "
+            f"{prediction}: has images of {w}x{h} pixels, but {truth} has {w2}x{h2}; "
             f"render again with the same view and `--resolution {max(w2, h2)}`"
         )
     if min(predicted.shape[:2]) < WINDOW:

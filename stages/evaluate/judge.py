@@ -63,7 +63,7 @@ def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
     jpegs = [sample_frames(film, FRAMES, LONGEST) for film in tqdm(films, unit="film")]
     for film, frames in zip(films, jpegs, strict=True):
         if len(frames) < 2:
-            raise InputError(f"{film}: has one frame only; motion is judged in two or more")
+            raise InputError(f"{film}: has only one frame; give a film of two or more frames")
     log.info("sending %d frames of %d films, %d times, to %s at %s", sum(map(len, jpegs)), len(films),
              options.repeats, endpoint.model, endpoint.url)  # fmt: skip
     questions = draw_questions(len(films), options)
@@ -75,7 +75,9 @@ def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
                 scores[i][name].append(answer[letter][name])
     failed = sum(answer is None for answer in answers)
     if failed == len(answers):
-        raise InputError(f"{endpoint.model} at {endpoint.url}: none of its answers could be used; try another --model")
+        raise InputError(
+            f"{endpoint.model} at {endpoint.url}: no answer of the model could be used; try another --model"
+        )
     return _result(films, scores, _notes(films, jpegs, questions, failed, endpoint))
 
 
@@ -85,10 +87,10 @@ def find_films(paths: Sequence[Path]) -> list[Path]:
     for path in map(Path, paths):
         inside = sorted(p for p in path.iterdir() if _is_film(p)) if path.is_dir() else [path]
         if not inside:
-            raise InputError(f"{path}: has no films in it; these are read: {' '.join(sorted(VIDEO_SUFFIXES))}")
+            raise InputError(f"{path}: contains no films; supported formats: {' '.join(sorted(VIDEO_SUFFIXES))}")
         if not path.is_dir() and path.suffix.lower() not in VIDEO_SUFFIXES:
             raise InputError(f"{path}: is not a film; give {', '.join(sorted(VIDEO_SUFFIXES))} or folders of them "
-                             "(of a trajectory: `ngff render` it first)")  # fmt: skip
+                             "(render a trajectory with `ngff render` first)")  # fmt: skip
         films += inside
     twice = {film for film in films if films.count(film) > 1}
     if twice:
@@ -180,16 +182,16 @@ class _Record:
         try:
             return parse(self.replies[str(k)]) if str(k) in self.replies else None
         except (InvalidReply, AttributeError) as error:
-            raise InputError(f"{self.path}: reply {k} was changed; ask again without --resume") from error
+            raise InputError(f"{self.path}: reply {k} was changed; start again without --resume") from error
 
     def _earlier(self) -> dict[str, str]:
         try:
             data = parse_json(self.path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise InputError(f"{self.path}: is damaged ({quote(error)}); ask again without --resume") from error
+            raise InputError(f"{self.path}: is damaged ({quote(error)}); start again without --resume") from error
         if not isinstance(data, dict) or {k: data.get(k) for k in self.head} != self.head or \
                 not isinstance(data.get("replies"), dict):  # fmt: skip
-            raise InputError(f"{self.path}: is of other films or options; ask again without --resume")
+            raise InputError(f"{self.path}: belongs to other films or options; start again without --resume")
         return data["replies"]
 
 

@@ -153,5 +153,5 @@ def _read_photo(scene: Scene, view: int, folder: Path) -> Image:
     files = [p for p in sorted(Path(folder).glob("*"))
              if p.stem == Path(name).stem and p.suffix.lower() in IMAGE_SUFFIXES]  # fmt: skip
     if not files:
-        raise InputError(f"--photos {folder}: holds no photo {name}; give the folder of the photos")
+        raise InputError(f"--photos {folder}: contains no photo {name}; give the folder of the scene's photos")
     return read_image(files[0])

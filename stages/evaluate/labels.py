@@ -166,13 +166,17 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
 def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:
     """Label images a.png or a.jpg.png of photos a.jpg, by camera index. Raises InputError if there are none."""
     if cameras is None or not len(cameras):
-        raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
+        raise InputError(
+            f"{prediction}: has no cameras; to compare with label images, give a scene written by `ngff reconstruct`"
+        )
     images = {path.stem: path for path in _label_images(folder)}
     stems = [Path(name).stem for name in cameras.names]
     named = {i: images.get(stem, images.get(cameras.names[i])) for i, stem in enumerate(stems)}
     files = {i: file for i, file in named.items() if file}
     if not files:
-        raise InputError(f"{folder}: no label image is named as a photo of {prediction}, such as {stems[0]}.png")
+        raise InputError(
+            f"{folder}: contains no label image named like a photo of {prediction}, such as {stems[0]}.png"
+        )
     return files
 
 

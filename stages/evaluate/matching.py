@@ -22,7 +22,7 @@ def match_objects(prediction: ReferenceFrame, truth: ReferenceFrame, names: list
     if len(predicted) < len(true) or (len(predicted) > len(true) and not names):
         raise InputError(
             f"{prediction.file}: has {len(predicted)} objects ({_names(predicted)}), but {truth.file} has {len(true)} "
-            f"({_names(true)}); name those to compare with --objects, as in --objects {shlex.quote(true[0].name)}"
+            f"({_names(true)}); name the objects to compare, as in --objects {shlex.quote(true[0].name)}"
             if true else f"{truth.file}: has no objects to compare"
         )  # fmt: skip
     by_name = {o.name: o for o in predicted}

@@ -15,27 +15,37 @@ MAX_FILMS_PER_QUESTION = 26  # most films in one question, as they are named by 
 class EvaluateOptions:
     """Options of the evaluate stage."""
 
-    align: bool = option(False, "first align the prediction with the truth, by shared cameras or objects")
-    frames: int | None = option(None, "compare the first N frames only; default: all, equal in number")
-    resample: bool = option(False, "interpolate the predicted motion at the frame times of the truth")
+    align: bool = option(
+        False, "first align the prediction with the ground truth, by cameras or objects that both share"
+    )
+    frames: int | None = option(
+        None, "compare only the first N frames; default: all frames, whose numbers must be equal"
+    )
+    resample: bool = option(False, "interpolate the predicted motion at the frame times of the ground truth")
     objects: str = option("", "names of the objects to compare, such as duck,ball; default: all")
-    undistorted: bool = option(False, "label images are of undistorted views; default: of the photos as taken")
-    photos: Path | None = option(None, "folder of the photos, for the report of a trajectory or of label images")
-    report: Path | None = option(None, "HTML report with curves and images to write (.html)")
+    undistorted: bool = option(False, "label images belong to undistorted views; default: to the photos as taken")
+    photos: Path | None = option(
+        None, "folder of the photos shown in the report (--report) of a trajectory or of label images"
+    )
+    report: Path | None = option(None, "report with curves and images to write (.html)")
     judge: bool = option(
         False,
-        "score films from 0 to 1 by a vision-language model: PhysR and PhotoR. Sends ten frames of "
-        "each film (JPEG, at most 512 px) and nothing else, no names, to $OPENAI_BASE_URL with "
-        "$OPENAI_API_KEY; without --judge nothing is sent anywhere",
+        "let a vision-language model score films from 0 to 1 (PhysR and PhotoR). Sends ten frames of "
+        "each film (JPEG, at most 512 px) but no names or other data to $OPENAI_BASE_URL, with "
+        "$OPENAI_API_KEY; without --judge nothing is sent",
     )
     model: str = option("", "with --judge: name of a model that accepts images; default: $OPENAI_MODEL")
     base_url: str = option(
-        "", "with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else OpenAI's own"
+        "", "with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else OpenAI's server"
     )
-    repeats: int = option(3, "with --judge: how often each film is scored; mean and standard deviation are given")
-    films_per_question: int = option(4, "with --judge: most films in one question, in random order under letters")
+    repeats: int = option(
+        3, "with --judge: number of times each film is scored; mean and standard deviation are reported"
+    )
+    films_per_question: int = option(
+        4, "with --judge: maximum number of films in one request, in random order and named by letters"
+    )
     timeout: float = option(120.0, "with --judge: maximum waiting time for an answer [s]")
-    resume: bool = option(False, "with --judge: continue an interrupted run, from the answers it has written")
+    resume: bool = option(False, "with --judge: continue an interrupted run from its stored answers")
     seed: int = option(0, "with --judge: random seed of the order of the films", min=0)
 
     def __post_init__(self):
@@ -49,7 +59,7 @@ class EvaluateOptions:
         if not 1 <= self.films_per_question <= MAX_FILMS_PER_QUESTION:
             raise InputError(f"--films-per-question {self.films_per_question}: give 1 to {MAX_FILMS_PER_QUESTION}")
         if self.photos is not None and self.report is None:
-            raise InputError(f"--photos {self.photos}: are shown in the report; add --report FILE.html")
+            raise InputError(f"--photos {self.photos}: photos are only shown in a report; add --report FILE.html")
 
     @property
     def object_names(self) -> list[str]:

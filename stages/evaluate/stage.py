@@ -77,9 +77,11 @@ def run(
 def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptions) -> tuple[Result, list[Path]]:
     """The metrics of a prediction, and the paths of both files."""
     if truth is None:
-        raise InputError(f"{predictions[0]}: name the truth with --against, or have films scored with --judge")
+        raise InputError(
+            f"{predictions[0]}: the ground truth is missing; name it with --against, or score films with --judge"
+        )
     if len(predictions) > 1:
-        raise InputError(f"{predictions[1]}: is a second prediction; with --against give one")
+        raise InputError(f"{predictions[1]}: is a second prediction; give only one with --against")
     (prediction,), truth = predictions, Path(truth)
     kind = _common_kind(prediction, truth)
     _check_options(kind, options)
@@ -91,7 +93,7 @@ def _judge(films: list[Path], truth: Path | None, out: Path, options: EvaluateOp
     from stages.evaluate.judge import find_films, judge
 
     if truth is not None:
-        raise InputError(f"--against {truth}: --judge scores films by themselves; give one of the two")
+        raise InputError(f"--against {truth}: --judge scores films without a ground truth; drop --against or --judge")
     _check_options("films", options)
     films = find_films(films)
     return judge(films, out, options), films
@@ -104,7 +106,7 @@ def _common_kind(prediction: Path, truth: Path) -> str:
         return "labels"
     if COMPARISONS[kinds[0]] != COMPARISONS[kinds[1]]:
         raise InputError(
-            f"{prediction}: is of kind {kinds[0]}, but {truth} is of kind {kinds[1]}; give two files of one kind"
+            f"{prediction}: is of kind {kinds[0]}, but {truth} is of kind {kinds[1]}; give two files of the same kind"
         )
     return kinds[0]
 

@@ -154,14 +154,14 @@ def _same_frames(predicted: Track, true: Track, options: EvaluateOptions, notes:
         notes.append(f"the prediction was interpolated to {1 / true.dt:g} frames a second, as given by --resample")
     if abs(predicted.dt - true.dt) > 1e-4 * true.dt:
         raise InputError(
-            f"{files[0]}: {1 / predicted.dt:g} frames a second, but {files[1]} has {1 / true.dt:g}; "
-            "give --resample to interpolate the prediction at the truth's times"
+            f"{files[0]}: has {1 / predicted.dt:g} frames per second, but {files[1]} has {1 / true.dt:g}; "
+            "give --resample to interpolate the prediction at the times of the ground truth"
         )
     shorter = min(len(predicted), len(true))
     if options.frames is None:
         if len(predicted) != len(true):
             raise InputError(
-                f"{files[0]}: {len(predicted)} frames, but {files[1]} has {len(true)}; "
+                f"{files[0]}: has {len(predicted)} frames, but {files[1]} has {len(true)}; "
                 f"give --frames {shorter} to compare the first {shorter}"
             )
         return predicted, true

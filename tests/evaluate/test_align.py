@@ -40,7 +40,7 @@ def test_shared_cameras_a_tenth_of_their_radius_apart_are_in_another_frame(shift
     with (
         nullcontext()
         if same
-        else pytest.raises(InputError, match="mine.h5: has another frame .* than true.h5 .cameras")
+        else pytest.raises(InputError, match="mine.h5: has a different frame .* than true.h5 .cameras")
     ):
         check_same_reference_frame(mine, truth, [(BALL, BALL)])
 

@@ -90,7 +90,7 @@ def test_videos_must_have_equal_length_rate_and_size(tmp_path):
         evaluate(tmp_path / "short.mp4", true, tmp_path, frames=5)
     with pytest.raises(InputError, match="1 frames, but .* has 6; give --frames 1"):
         evaluate(video(tmp_path / "single.mp4", 1), true, tmp_path)
-    with pytest.raises(InputError, match="50 frames a second.*--fps 25"):
+    with pytest.raises(InputError, match="50 frames per second.*--fps 25"):
         evaluate(video(tmp_path / "fast.mp4", 6, fps=50.0), true, tmp_path)
     with pytest.raises(InputError, match="64x64.*--resolution 48"):
         evaluate(video(tmp_path / "large.mp4", 6, size=64), true, tmp_path)
@@ -116,7 +116,7 @@ def test_frames_compares_the_first_ones_and_says_so(tmp_path):
     assert any("only the first 2 frames" in note for note in first["notes"])
     assert not any("only the first" in note for note in whole["notes"])
     assert evaluate(mine, true, tmp_path, frames=1)["overall"]["frames"] == 1
-    with pytest.raises(InputError, match="both have only 3 frames; give 3 or fewer"):
+    with pytest.raises(InputError, match="both files have only 3 frames; give 3 or fewer"):
         evaluate(mine, true, tmp_path, frames=4)
 
 
@@ -147,5 +147,5 @@ def test_rates_of_videos_may_differ_by_a_thousandth(tmp_path, monkeypatch, fps, 
     if same:
         assert images._check_rates(tmp_path / "mine.mp4", tmp_path / "true.mp4") == []
     else:
-        with pytest.raises(InputError, match="frames a second, but .*ngff render --fps 25"):
+        with pytest.raises(InputError, match="frames per second, but .*ngff render --fps 25"):
             images._check_rates(tmp_path / "mine.mp4", tmp_path / "true.mp4")

@@ -126,7 +126,7 @@ def test_a_question_without_a_usable_reply_is_left_out_and_said(chat_server, fil
     assert "1 of 3 questions got no usable answer in 3 tries and are left out" in facts["notes"]
     chat_server.script = ["no"] * 9
     (tmp_path / "m.json").unlink()
-    with pytest.raises(InputError, match="none of its answers could be used"):
+    with pytest.raises(InputError, match="no answer of the model could be used"):
         judged([films / "ours/a.mp4"], tmp_path)
     assert not (tmp_path / "m.json").exists()
 
@@ -136,14 +136,14 @@ def test_an_interrupted_run_continues(chat_server, films, tmp_path):
     with pytest.raises(InputError, match="400"):
         judged([films / "ours/a.mp4"], tmp_path)
     assert not (tmp_path / "m.json").exists()
-    with pytest.raises(InputError, match="m.replies.json: is of other films or options"):
+    with pytest.raises(InputError, match="m.replies.json: belongs to other films or options"):
         judged([films / "ours/b.mp4"], tmp_path, resume=True)
     chat_server.script, chat_server.asked = [json.dumps(GOOD)] * 2, []
     assert judged([films / "ours/a.mp4"], tmp_path, resume=True)["overall"]["repeats"] == 3
     assert len(chat_server.asked) == 2
     changed = json.loads((tmp_path / "m.replies.json").read_text())
     changed["replies"]["1"] = "seven"
-    for text, says in (("{", "is damaged"), ("[]", "is of other"), (json.dumps(changed), "reply 1 was changed; ask")):
+    for text, says in (("{", "is damaged"), ("[]", "belongs to other"), (json.dumps(changed), "reply 1 was changed")):
         (tmp_path / "m.replies.json").write_text(text)
         with pytest.raises(InputError, match=says):
             judged([films / "ours/a.mp4"], tmp_path, resume=True)
@@ -156,14 +156,14 @@ def test_wrong_films_and_options_send_nothing(chat_server, films, tmp_path):
     write_png(tmp_path / "x.png", torch.zeros(16, 16, 3))
     with VideoWriter(tmp_path / "one.mp4", 20.0) as out:
         out.append(torch.zeros(32, 32, 3))
-    for given, says in ((tmp_path / "empty", "has no films"), (tmp_path / "x.mp4", "not a video that can be read"),
-                        (tmp_path / "x.png", "is not a film"), (tmp_path / "one.mp4", "one frame only"),
+    for given, says in ((tmp_path / "empty", "contains no films"), (tmp_path / "x.mp4", "not a video that can be read"),
+                        (tmp_path / "x.png", "is not a film"), (tmp_path / "one.mp4", "only one frame"),
                         (film.parent, "is given twice"), (tmp_path / "no.mp4", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=says):
             judged([film, given], tmp_path)
     with pytest.raises(InputError, match="there is no folder"):
         run(film, None, tmp_path / "no/m.json", EvaluateOptions(judge=True))
-    with pytest.raises(InputError, match="--against .*give one of the two"):
+    with pytest.raises(InputError, match="--against .*drop --against or --judge"):
         run(film, film, None, EvaluateOptions(judge=True))
     with pytest.raises(InputError, match="--align: does not apply to files of kind films"):
         run(film, None, None, EvaluateOptions(judge=True, align=True))
@@ -184,7 +184,7 @@ def test_the_command(chat_server, films, tmp_path, monkeypatch):
     assert facts["kind"] == "films" and not math.isnan(facts["overall"]["PhysR_sd"])
     assert chat_server.asked[0][1]["model"] == "other"
     done = CliRunner().invoke(app, ["evaluate", str(films / "ours/a.mp4")])
-    assert done.exit_code == 2 and "name the truth with --against, or have films scored with --judge" in done.stderr
+    assert done.exit_code == 2 and "name it with --against, or score films with --judge" in done.stderr
     monkeypatch.delenv("OPENAI_API_KEY")
     monkeypatch.delenv("OPENAI_BASE_URL")
     done = CliRunner().invoke(app, words)

@@ -224,7 +224,7 @@ def write_16_bits(path: Path) -> None:
         (lambda f: (f / "names.json").unlink(), "labels/names.json: no such file; the names of the labelled objects"),
         (lambda f: (f / "names.json").write_text('["duck"]'), "names.json: is not readable"),
         (lambda f: (f / "names.json").write_text('{"1": {"core": true}}'), "names.json: is not readable"),
-        (lambda f: (f / "a.b.png").rename(f / "b.png"), "no label image is named as a photo of .*, such as a.b.png"),
+        (lambda f: (f / "a.b.png").rename(f / "b.png"), "no label image named like a photo of .*, such as a.b.png"),
         (lambda f: write_colour(f / "a.b.png"), "a.b.png: has 3 channels; a label image has one"),
         (lambda f: write_16_bits(f / "a.b.png"), "a.b.png: has 16 bits per pixel; save the label image with 8"),
         (lambda f: (f / "a.b.png").write_bytes(b"hello"), "a.b.png: is not an image"),
@@ -242,10 +242,10 @@ def test_malformed_labels_give_one_line_and_write_nothing(labelled, damage, mess
 
 
 def test_other_wrong_inputs(labelled):
-    with pytest.raises(InputError, match="--photos x: are shown in the report"):
+    with pytest.raises(InputError, match="--photos x: photos are only shown in a report"):
         EvaluateOptions(photos=Path("x"))
     (labelled / "empty").mkdir()
-    with pytest.raises(InputError, match="empty: holds no photo a.b.jpg"):
+    with pytest.raises(InputError, match="empty: contains no photo a.b.jpg"):
         evaluate(labelled, report=labelled / "r.html", photos=labelled / "empty")
     with pytest.raises(InputError, match="--align: does not apply to files of kind labels"):
         evaluate(labelled, align=True)

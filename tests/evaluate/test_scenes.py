@@ -60,7 +60,7 @@ def test_transparent_gaussians_are_ignored_and_colour_is_compared(tmp_path, two_
 def test_another_reference_frame_needs_align(tmp_path, two_balls):
     similarity = Similarity(0.3, rotation(1.0), torch.tensor([4.0, 5.0, 6.0]))
     predicted = transformed_scene(two_balls, similarity)
-    with pytest.raises(InputError, match="another frame of reference.*--align"):
+    with pytest.raises(InputError, match="a different frame of reference.*--align"):
         evaluate(tmp_path, predicted, two_balls)
     assert evaluate(tmp_path, predicted, two_balls, align=True)["overall"]["chamfer"] < 1e-5
 

@@ -81,8 +81,8 @@ def test_report_shows_photos_objects_and_times(tmp_path, two_balls):
     ("name", "content", "message"),
     [("x.txt", b"hello", "suffix .txt cannot be compared"), ("x.h5", b"", "is empty"),
      ("x.h5", b"hello", "not a readable HDF5"),
-     ("x.ply", b"hello", "two files of one kind"), ("x.h5", None, "no such file"),
-     ("x.mp4", b"hello", "two files of one kind")],
+     ("x.ply", b"hello", "two files of the same kind"), ("x.h5", None, "no such file"),
+     ("x.mp4", b"hello", "two files of the same kind")],
 )  # fmt: skip
 def test_wrong_files_give_one_line_and_write_nothing(tmp_path, two_balls, name, content, message):
     true = write_motion(tmp_path / "true.h5", two_balls)
@@ -94,9 +94,9 @@ def test_wrong_files_give_one_line_and_write_nothing(tmp_path, two_balls, name, 
 
 
 def test_one_prediction_is_compared_with_one_truth():
-    with pytest.raises(InputError, match="a.ply: name the truth with --against"):
+    with pytest.raises(InputError, match="a.ply: the ground truth is missing; name it with --against"):
         run([Path("a.ply")], None, None, EvaluateOptions())
-    with pytest.raises(InputError, match="b.ply: is a second prediction; with --against give one"):
+    with pytest.raises(InputError, match="b.ply: is a second prediction; give only one with --against"):
         run([Path("a.ply"), Path("b.ply")], Path("c.ply"), None, EvaluateOptions())
 
 

@@ -152,7 +152,7 @@ def test_different_lengths_and_rates_need_an_option(tmp_path, two_balls):
         evaluate(tmp_path, frames=10)
     write_motion(tmp_path / "mine.h5", two_balls, frames=23, dt=0.01, spin=0.0, speed=0.015)
     write_motion(tmp_path / "true.h5", two_balls, frames=12, dt=0.02, spin=0.0, speed=0.03)
-    with pytest.raises(InputError, match="100 frames a second, but .* has 50; give --resample"):
+    with pytest.raises(InputError, match="100 frames per second, but .* has 50; give --resample"):
         evaluate(tmp_path)
     facts = evaluate(tmp_path, resample=True)
     assert facts["overall"]["frames"] == 12

@@ -93,7 +93,7 @@ def open_animation(source: Path, frame: int | None = None, device: str = "cpu") 
                          f"give {EXPECTED}")  # fmt: skip
     if FORMATS[suffix].kind == "scene":
         if frame is not None:
-            raise InputError(f"--frame {frame}: {source} is a scene at rest and has no frames; omit it")
+            raise InputError(f"--frame {frame}: {source} is a scene, which has no frames; omit --frame")
         return Animation(FORMATS[suffix].read(source))
     trajectory = FORMATS[suffix].read(source)
     count = len(trajectory)

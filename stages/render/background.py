@@ -62,7 +62,7 @@ def open_background(choice: str | None, scene: Scene) -> RenderBackground:
         if (g.object_id == 0).any():
             g = g[g.object_id == 0]
         else:
-            log.info("%s: all Gaussians belong to objects; all are used as background", choice)
+            log.info("%s: all Gaussians belong to objects; the objects are used as background too", choice)
         return RenderBackground(keep_scene=False, gaussians=g)
     if suffix in IMAGE_SUFFIXES:
         return RenderBackground(keep_scene=False, photo=read_image(Path(choice)))

@@ -157,14 +157,15 @@ def find_camera(cameras: Cameras | None, key: str) -> int:
     Raises InputError if there is no such camera.
     """
     if cameras is None:
-        raise InputError(f"--view input:{key}: the file holds no cameras; use --view novel or --view orbit")
+        raise InputError(f"--view input:{key}: the file contains no cameras; use --view novel or --view orbit")
     by_name = {name: i for i, full in enumerate(cameras.names) for name in (full.rsplit(".", 1)[0], full)}
     if key in by_name and not (key.isdigit() and int(key) < len(cameras)):
         return by_name[key]
     if key.isdigit() and int(key) < len(cameras):
         return int(key)
     some = ", ".join(cameras.names[:3])
-    raise InputError(f"--view input:{key}: no such camera; there are cameras 0 to {len(cameras) - 1}, and photos such "
+    raise InputError(f"--view input:{key}: there is no such camera; give a number from 0 to {len(cameras) - 1}, "
+                     "or a photo such "
                      f"as {some}")  # fmt: skip
 
 

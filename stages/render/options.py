@@ -29,23 +29,26 @@ OUTPUT_FORMATS = {
 class RenderOptions:
     """Options of the render stage."""
 
-    view: str = option("novel", f"camera: {VIEWS}")
-    resolution: int = option(640, "longest side of a view [px]")
-    fps: float | None = option(
-        None, "frames per second, at unchanged speed of motion; default: the trajectory's, 30 for a scene"
+    view: str = option(
+        "novel",
+        f"camera: {VIEWS} (input:K: of photo K; all: of every photo)",
     )
-    background: str | None = option(None, "scene.ply, #rrggbb or a photo that replaces the scene's own background")
-    depth: bool = option(False, "render depth: colour-coded in MP4, 16 bit in PNG")
-    ids: bool = option(False, "render each object in one flat colour, with its number and a legend")
-    shadows: str = option("on", "soft shadows of objects that moved: on | off")
+    resolution: int = option(640, "longest side of the output [px]")
+    fps: float | None = option(
+        None, "frames per second, at unchanged speed of motion; default: as in the trajectory, 30 for a scene"
+    )
+    background: str | None = option(None, "scene.ply, colour #rrggbb or photo that replaces the scene's own background")
+    depth: bool = option(False, "render depth instead of colour: colour-coded in MP4, 16 bits in PNG")
+    ids: bool = option(False, "render each object in a flat colour, with its number and a legend")
+    shadows: str = option("on", "soft shadows cast by objects that moved: on | off")
     show_forces: bool = option(False, "draw an arrow for each active force prompt")
     playable: bool = option(
         False,
         "with -o film.html: objects can be dragged, pushed and lifted in the page, which computes "
-        "their motion (trajectories of --engine ngff --contact learned)",
+        "their motion (only for trajectories of --engine ngff --contact learned)",
     )
-    frame: int | None = option(None, "render this frame only, from 0; -1 is the last; default: all")
-    side_by_side: bool = option(False, "render several files in one image, with the same camera")
+    frame: int | None = option(None, "render only this frame, counted from 0 (-1: the last); default: all frames")
+    side_by_side: bool = option(False, "render several files next to each other in one image, with the same camera")
     device: str = device_option()
 
     def __post_init__(self):
@@ -54,13 +57,15 @@ class RenderOptions:
         if kind not in ("novel", "orbit", "all", "input") and not self.view.lower().endswith(".json"):
             raise InputError(f"--view {self.view}: choose from {VIEWS}")
         if kind == "input" and not self.view[6:]:
-            raise InputError("--view input: name the camera, as in --view input:0 or --view input:IMG_12.jpg")
+            raise InputError(
+                "--view input: the camera is missing; write --view input:0 or --view input:IMG_12.jpg, for example"
+            )
         if not 16 <= self.resolution <= 8192:
             raise InputError(f"--resolution {self.resolution}: the longest side must be 16 to 8192 pixels")
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise InputError(f"--fps {self.fps}: must be above 0 and at most 1000 frames per second")
         if self.depth and self.ids:
-            raise InputError("--depth and --ids: give only one of them")
+            raise InputError("--depth and --ids: cannot be combined; give only one of them")
         if self.shadows not in ("on", "off"):
             raise InputError(f"--shadows {self.shadows}: choose from on | off")
         if self.background is not None and self.background.startswith("#"):

@@ -54,16 +54,16 @@ def write_page(out: Path, renderer: Renderer) -> dict:
 def _check(out: Path, renderer: Renderer) -> None:
     options, clip = renderer.options, renderer.clips[0]
     if len(renderer.clips) > 1:
-        raise InputError(f"{out}: a page shows one file; omit --side-by-side, or write a video (.mp4)")
+        raise InputError(f"{out}: a page can show only one file; omit --side-by-side, or write a video (.mp4)")
     if options.view == "all":
-        raise InputError(f"{out}: --view all is for images; a page has a list of all photos' views")
+        raise InputError(f"{out}: --view all only works with images; omit it, as a page lists the views of all photos")
     if clip.background.photo is not None:
-        raise InputError(f"{out}: --background of a page is a colour or a scene.ply, not a photo")
+        raise InputError(f"{out}: the --background of a page must be a colour or a scene.ply, not a photo")
     trajectory = clip.animation.trajectory
     if options.playable and not clip.animation.is_moving:
-        raise InputError(f"--playable: {clip.name} has no motion to go on from; give a trajectory, without --frame")
+        raise InputError(f"--playable: {clip.name} has no motion to continue; give a trajectory and omit --frame")
     if clip.animation.is_moving and len(trajectory.keypoints.rest) > MAX_KEYPOINTS:
-        raise InputError(f"{trajectory.path}: has {len(trajectory.keypoints.rest)} keypoints, and a page holds "
+        raise InputError(f"{trajectory.path}: has {len(trajectory.keypoints.rest)} keypoints, but a page can hold "
                          f"{MAX_KEYPOINTS}; simulate with fewer --keypoints, or write a video (.mp4)")  # fmt: skip
     if clip.animation.is_moving and trajectory.dense:
         raise InputError(f"{trajectory.path}: stores every Gaussian of every frame, which a page cannot hold; write a "

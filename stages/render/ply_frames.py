@@ -32,6 +32,6 @@ def write_ply_frames(out: Path, renderer: Renderer) -> dict:
         write_scene(path, replace(scene, gaussians=clip.gaussians(time)))
         size = path.stat().st_size
         if not i and size * len(times) > LARGE:
-            log.warning("%s: %d files of %.0f MB; lower --fps for fewer", out, len(times), size / 1e6)
+            log.warning("%s: %d files of %.0f MB are written; lower --fps to write fewer", out, len(times), size / 1e6)
         total += size
     return {"frames": len(times), "fps": renderer.fps, "bytes": total, **renderer.light_facts()}

@@ -137,17 +137,17 @@ class Renderer:
         first = next((c for c in stored if c is not None), None)
         if all(c is None or _same_cameras(first, c) for c in stored):
             return [self._path(first, merge_subjects(subjects), frames, resolution)] * len(animations)
-        log.warning("the cameras of the files differ: each file is rendered with a camera path of its own")
+        log.warning("the cameras of the files differ, so that each file is rendered with its own camera path")
         paths = [self._path(c, subject, frames, resolution) for c, subject in zip(stored, subjects, strict=True)]
         if len({len(path) for path in paths}) > 1:
-            raise InputError("--view all: the files hold different numbers of cameras; choose another --view")
+            raise InputError("--view all: the files contain different numbers of cameras; choose another --view")
         return paths
 
     def _path(self, stored: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
         if self.options.view != "all":
             return camera_path(self.options.view, stored, subject, frames, resolution)
         if stored is None:
-            raise InputError("--view all: the file holds no cameras; use --view novel or --view orbit")
+            raise InputError("--view all: the file contains no cameras; use --view novel or --view orbit")
         return scale_cameras(stored, max(16, 2 * resolution // grid_columns(len(stored))))
 
     def render(self, time: float, cameras: list[Cameras], indices: list[int]) -> Views:

@@ -43,10 +43,13 @@ def write_spz(out: Path, renderer: Renderer) -> dict:
     """Write one frame as SPZ. Raises InputError for a motion, and for scenes too large for its 24-bit positions."""
     clip = only_clip(out, renderer)
     if clip.animation.is_moving:
-        raise InputError(f"{out}: SPZ holds one frame; choose it with --frame, or write a .glb or .html")
+        raise InputError(f"{out}: an SPZ file holds one frame; choose it with --frame, or write a .glb or .html")
     g = _y_up(clip.gaussians(0.0).to("cpu"))
     if len(g) and float(g.means.abs().max()) >= MAX_SPZ_POSITION:
-        raise InputError(f"{out}: SPZ holds positions up to {MAX_SPZ_POSITION:.0f} units; this scene reaches further")
+        raise InputError(
+            f"{out}: SPZ stores positions up to {MAX_SPZ_POSITION:.0f} units, but this scene is "
+            "larger; write another format"
+        )
     with replacing(out) as part:
         part.write_bytes(gzip.compress(_spz(g), mtime=0))
     return {"gaussians": len(g), "bytes": out.stat().st_size}
@@ -121,9 +124,11 @@ def only_clip(out: Path, renderer: Renderer) -> Clip:
     """The clip for a format that contains one scene. Raises InputError for options that the format does not support."""
     options = renderer.options
     if len(renderer.clips) > 1 or options.view == "all" or options.depth:
-        raise InputError(f"{out}: holds one scene; omit --side-by-side, --view all and --depth")
+        raise InputError(f"{out}: such a file holds one scene; omit --side-by-side, --view all and --depth")
     if options.show_forces:
-        raise InputError(f"{out}: holds no arrows; omit --show-forces, or write an image, a video or a page (.html)")
+        raise InputError(
+            f"{out}: such a file cannot hold arrows; omit --show-forces, or write an image, a video or a page (.html)"
+        )
     return renderer.clips[0]
 
 

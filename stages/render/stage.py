@@ -40,14 +40,14 @@ def run(
     out = Path(out) if out is not None else _default_output(sources, renderer)
     if options.playable and out.suffix.lower() != ".html":
         page = out.with_suffix(".html").name
-        raise InputError(f"--playable: only a page (-o {page}) computes motion, not {out.name}")
+        raise InputError(f"--playable: only works with a page as output (-o {page}), not with {out.name}")
     if out.is_dir():
         out = out / "frame.ply"
     write = _writer(out)
     check_output(out)
     used = [Path(p) for p in (*sources, options.background, options.view) if p is not None and Path(p).is_file()]
     if out.exists() and any(out.samefile(path) for path in used):
-        raise InputError(f"{out}: is a file that is rendered; name another to write")
+        raise InputError(f"{out}: is one of the files to render; name another file to write")
     facts = write(out, renderer)
     scenes = [animation.scene.provenance for animation in animations]
     facts = {**provenance("render", used, options), **facts, "scene": scenes[0] if len(scenes) == 1 else scenes}
@@ -72,7 +72,7 @@ def _check_count(sources: list[Path], options: RenderOptions) -> None:
     if len(sources) > 1 and not options.side_by_side:
         raise InputError(f"{len(sources)} files: add --side-by-side to render them together, or give one at a time")
     if len(sources) == 1 and options.side_by_side:
-        raise InputError(f"--side-by-side: only one file, {sources[0]}; give two or more")
+        raise InputError(f"--side-by-side: {sources[0]} is the only file; give two or more")
     if len(sources) > MAX_FILES:
         raise InputError(f"--side-by-side: at most {MAX_FILES} files, not {len(sources)}")
 

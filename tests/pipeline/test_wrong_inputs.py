@@ -177,7 +177,7 @@ def test_folders_of_the_lab_that_are_files_are_reported_before_the_work(line):
 
 def test_a_file_is_not_rendered_over_itself(input_files):
     before = (input_files / "good.ply").read_bytes()
-    assert "is a file that is rendered; name another" in fails_cleanly("render good.ply -o good.ply")
+    assert "is one of the files to render; name another" in fails_cleanly("render good.ply -o good.ply")
     assert (input_files / "good.ply").read_bytes() == before
 
 

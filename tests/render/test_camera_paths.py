@@ -79,9 +79,9 @@ def test_find_camera_by_index_and_by_name():
     assert find_camera(cameras, "4") == 4
     assert find_camera(cameras, "03.png") == 3 and find_camera(cameras, "03") == 3
     for key in ("6", "-1", "kitchen.jpg"):
-        with pytest.raises(InputError, match="cameras 0 to 5, and photos such as 00.png"):
+        with pytest.raises(InputError, match="from 0 to 5, or a photo such as 00.png"):
             find_camera(cameras, key)
-    with pytest.raises(InputError, match="holds no cameras; use --view novel"):
+    with pytest.raises(InputError, match="contains no cameras; use --view novel"):
         find_camera(None, "0")
 
 

@@ -114,7 +114,7 @@ def test_files_with_different_cameras_get_a_camera_each(tmp_path, two_balls, cap
     for file, scene in zip(files, (two_balls, moved), strict=True):
         write_scene(file, scene)
     left, right = read_image(run(files, tmp_path / "p.png", options(view="input:2"))).chunk(2, 1)
-    assert (left[:70] - right[:70]).abs().mean() < 0.01 and "camera path of its own" in caplog.text
+    assert (left[:70] - right[:70]).abs().mean() < 0.01 and "its own camera path" in caplog.text
 
 
 def test_captions_of_files_with_equal_names(tmp_path, two_balls):
@@ -127,8 +127,8 @@ def test_captions_of_files_with_equal_names(tmp_path, two_balls):
 
 @pytest.mark.parametrize(
     ("count", "choices", "message"),
-    [(2, {"side_by_side": False}, "2 files: add --side-by-side"), (1, {}, "only one file, .*a.h5"),
-     (9, {}, "at most 8"), (2, {"view": "input:77"}, "cameras 0 to 5")],
+    [(2, {"side_by_side": False}, "2 files: add --side-by-side"), (1, {}, "a.h5 is the only file"),
+     (9, {}, "at most 8"), (2, {"view": "input:77"}, "number from 0 to 5")],
 )  # fmt: skip
 def test_wrong_options_give_one_line(pair, count, choices, message):
     with pytest.raises(InputError, match=message) as caught:

@@ -176,12 +176,12 @@ def test_what_a_file_cannot_hold_is_said(scene, tmp_path):
     _, path = write_motion(tmp_path / "traj.h5", scene)
     with pytest.raises(InputError, match="one frame"):
         run(path, tmp_path / "x.spz", render_options())
-    with pytest.raises(InputError, match="holds no arrows; omit --show-forces"):
+    with pytest.raises(InputError, match="cannot hold arrows; omit --show-forces"):
         run(path, tmp_path / "x.glb", render_options(show_forces=True))
     run(path, tmp_path / "x.spz", render_options(frame=1))
     far = replace(scene.gaussians, means=3000 * scene.gaussians.means)
     write_scene(tmp_path / "far.ply", replace(scene, gaussians=far))
-    with pytest.raises(InputError, match="reaches further"):
+    with pytest.raises(InputError, match="scene is larger"):
         run(tmp_path / "far.ply", tmp_path / "x.spz", render_options())
 
 

@@ -205,7 +205,7 @@ def test_fps_option_keeps_the_speed_of_motion(trajectory, tmp_path):
 
 @pytest.mark.parametrize(
     ("choices", "message"),
-    [({"view": "sideways"}, "choose from novel"), ({"view": "input:"}, "name the camera"), ({"resolution": 4}, "16 to"),
+    [({"view": "sideways"}, "choose from novel"), ({"view": "input:"}, "is missing"), ({"resolution": 4}, "16 to"),
      ({"fps": 0.0}, "--fps"), ({"depth": True, "ids": True}, "only one"), ({"background": "#12"}, "#rrggbb")],
 )  # fmt: skip
 def test_invalid_options(choices, message):
@@ -215,7 +215,7 @@ def test_invalid_options(choices, message):
 
 @pytest.mark.parametrize(
     ("out", "choices", "message"),
-    [("a.gif", {}, r"use \.mp4, \.jpg, \.png"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
+    [("a.gif", {}, r"use \.mp4, \.jpg, \.png"), ("a.png", {"view": "input:99"}, "number from 0 to 5"),
      ("a.png", {"view": "nowhere.json"}, "no such file"), ("a.png", {"frame": 1}, "has no frames"),
      ("a.png", {"background": "x.txt"}, "give a scene.ply, a colour"), ("no/a.png", {}, "there is no folder"),
      ("no/a.mp4", {}, "there is no folder")],

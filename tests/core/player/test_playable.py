@@ -154,7 +154,7 @@ def test_only_motions_of_the_learned_field_are_playable(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             playable_parts(wrong)
-    with pytest.raises(InputError, match="only a page"):
+    with pytest.raises(InputError, match="only works with a page"):
         render(tmp_path / "traj.h5", tmp_path / "film.mp4", RenderOptions(playable=True))
     with pytest.raises(InputError, match="no motion"):
         render(tmp_path / "scene.ply", tmp_path / "film.html", RenderOptions(playable=True))

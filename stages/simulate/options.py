@@ -26,7 +26,7 @@ STANDARD_GRAVITY = 9.81  # [m/s^2]
 ENGINES = {
     "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for soft elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
-    "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies by MuJoCo, for stiff ones"),
+    "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies (MuJoCo), for stiff objects"),
 }
 DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with LIVE_KEYPOINTS two CPU cores keep up with real time
 CONTACTS = (AUTO, "learned", "solved")

@@ -8,7 +8,7 @@ app = new_app()
 
 @app.callback()
 def _bench() -> None:
-    """Run a benchmark; each compares with a baseline in the same run."""
+    """Run a benchmark; each also measures a baseline in the same run."""
 
 
 for _part in (bench_scenes, bench_motion, bench_speed):

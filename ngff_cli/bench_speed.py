@@ -55,7 +55,7 @@ add_benchmark(
     "pi3",
     "stages.lab.bench.pi3:run",
     Pi3BenchOptions,
-    "π³ at its published size with random weights: time and memory, compared with unfused attention.",
+    "π³ network at its published size, with random weights: time and memory, compared with unfused attention.",
 )
 
 

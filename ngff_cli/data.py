@@ -180,7 +180,8 @@ def clutter(
 ) -> None:
     """Generate labelled scenes of objects on tables, desks, shelves and floors, to train the segmentation.
 
-    Without options, run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
+    To train on reconstructions of the photos, run on each scene `ngff reconstruct NNNN/photos --cameras
+    NNNN/transforms.json -o NNNN/scene.ply`, unless --reconstruct or --exact is given.
     """
     from stages.lab.clutter.scenes import run
 

@@ -113,7 +113,7 @@ def fit(
     """Estimate materials and initial velocities of objects from a tracked motion, or from films: SCENE.ply and TRACK.h5
     or FILM.mp4... -> MATERIALS.json.
 
-    Films must be from fixed cameras of the scene, and named as these: camera03.mp4, or IMG_3.mp4 for a photo IMG_3.jpg.
+    Films must be from fixed cameras of the scene and named like them: camera03.mp4, or IMG_3.mp4 for a photo IMG_3.jpg.
     They must start with the state of the scene and have the same frame rate; for a scene of `ngff reconstruct
     CAMERAS/ --sequence` the start is stored in the scene. Several films are better than one, which hardly shows depth.
     """
@@ -136,8 +136,8 @@ def track(
 ) -> None:
     """Follow the objects of a scene through the films of several cameras: SCENE.ply and CAMERAS/ -> TRUTH.h5.
 
-    The scene is made by `ngff reconstruct CAMERAS/ --sequence` and `ngff segment`; `ngff evaluate` takes the result as
-    the truth.
+    Make the scene with `ngff reconstruct CAMERAS/ --sequence` and `ngff segment`; `ngff evaluate` takes the result as
+    the ground truth.
     """
     from stages.lab.track.track import run
 

@@ -71,7 +71,7 @@ def make_background(name: str) -> Gaussians:
 
 def _known(name: str) -> str:
     if name not in BACKGROUNDS:
-        raise InputError(f"no background called {name!r}; choose from {', '.join(BACKGROUNDS)}")
+        raise InputError(f"there is no background called {name!r}; choose from {', '.join(BACKGROUNDS)}")
     return name
 
 

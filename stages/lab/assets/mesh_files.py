@@ -30,14 +30,14 @@ def _in_folder(folder: Path) -> list[tuple[Path, ...]]:
     suffix = {p: MESH_SUFFIXES.index(p.suffix.lower()) for p in folder.rglob("*")
               if p.suffix.lower() in MESH_SUFFIXES and p.is_file() and not p.name.startswith(".")}  # fmt: skip
     if not suffix:
-        raise InputError(f"{folder}: holds no meshes; give a folder with files of suffix {' '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{folder}: contains no meshes; give a folder with files of suffix {' '.join(MESH_SUFFIXES)}")
     objects: dict[Path, dict[str, Path]] = {}
     for path in sorted(suffix, key=lambda p: (p.parent, p.stem, suffix[p])):
         objects.setdefault(path.parent / _common_stem(path), {}).setdefault(path.stem, path)
     for name, parts in objects.items():
         if len(parts) > 1:
             names = ", ".join(p.name for p in parts.values())
-            log.warning("%s: %s are read as the parts of one object", name.parent, names)
+            log.warning("%s: %s are read as parts of one object", name.parent, names)
     return [tuple(parts.values()) for parts in objects.values()]
 
 

@@ -45,7 +45,7 @@ def read_mesh(files: Path | Sequence[Path], count: int, up: str = "auto", light:
     if up not in (*UP_ROTATIONS, "auto"):
         raise InputError(f"--up {up}: choose from auto, x, y, z")
     if count < 100:
-        raise InputError(f"--count {count}: at least 100 Gaussians are needed")
+        raise InputError(f"--count {count}: give at least 100 Gaussians")
     up = ("y" if path.suffix.lower() in (".glb", ".gltf") else "z") if up == "auto" else up
     meshes = [mesh for path in files for mesh in _load(path)]
     with single_threaded():
@@ -72,9 +72,9 @@ def _load(path: Path) -> list:
     except Exception as error:  # trimesh's readers raise many types of exceptions
         raise InputError(f"{path}: cannot be read as a mesh ({error}); export it again") from error
     if not meshes:
-        raise InputError(f"{path}: holds no triangles; a mesh with faces is needed (this may be a point cloud)")
+        raise InputError(f"{path}: contains no triangles; give a mesh with faces (this may be a point cloud)")
     if any(m.vertices.shape[1] != 3 for m in meshes):
-        raise InputError(f"{path}: has vertices without three coordinates; export it again as a mesh in space")
+        raise InputError(f"{path}: has vertices without three coordinates; export it again as a 3D mesh")
     if not all(np.isfinite(m.triangles).all() for m in meshes):
         raise InputError(f"{path}: has vertices that are not finite; repair the mesh or export it again")
     if any(m.visual.kind == "texture" and m.visual.uv is not None and _texture(m) is None for m in meshes):
@@ -109,7 +109,7 @@ def _sample_faces(files: Sequence[Path], meshes: list, n: int) -> tuple[Tensor, 
     triangles = (triangles - (low + high) / 2) / max((high - low).max(), np.finfo(float).tiny)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     if not np.linalg.norm(cross, axis=1).sum() > MIN_AREA:
-        raise InputError(f"{files[0]}: its triangles have no area, all vertices are on a line; export it again as a "
+        raise InputError(f"{files[0]}: its triangles have no area, as all vertices are on a line; export it again as a "
                          "surface")  # fmt: skip
     cross *= winding_signs(triangles)[:, None]
     sizes = [len(mesh.faces) for mesh in meshes]

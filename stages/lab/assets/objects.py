@@ -60,10 +60,10 @@ ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # portr
 class ObjectsOptions:
     """Which objects to write, and how meshes are converted to Gaussians."""
 
-    only: str = option("", "names of the objects, such as ball,duck; default: all ten")
-    count: int = option(40_000, "approximate number of Gaussians of a mesh", min=100)
-    up: str = option("auto", "up axis of a mesh: auto | x | y | z")
-    light: bool = option(True, "bake soft light into the colours of a mesh")
+    only: str = option("", "names of the objects to generate, such as ball,duck; default: all ten")
+    count: int = option(40_000, "approximate number of Gaussians per mesh", min=100)
+    up: str = option("auto", "up axis of the meshes: auto | x | y | z")
+    light: bool = option(True, "bake soft light into the colours of the meshes")
 
 
 def make_object(name: str) -> Gaussians:
@@ -82,7 +82,7 @@ def make_object(name: str) -> Gaussians:
 
 def _known(name: str) -> str:
     if name not in OBJECTS:
-        raise InputError(f"no object called {name!r}; choose from {', '.join(OBJECTS)}")
+        raise InputError(f"there is no object called {name!r}; choose from {', '.join(OBJECTS)}")
     return name
 
 
@@ -100,7 +100,9 @@ def run(
     from stages.render.overlay import tile_images
 
     if meshes and options.only:
-        raise InputError("--only names objects of the data set and --from meshes; give one of the two")
+        raise InputError(
+            "--only and --from: cannot be combined; --only names objects of the data set, and --from gives meshes"
+        )
     out, images = Path(out), []
     sources: dict[str, Sequence[Path]] = {}
     for files in find_objects(meshes):

@@ -66,7 +66,9 @@ def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str],
             trainee, pieces, unseen.to(device), options, ProcessGroup(device=device), Path(folder) / "weights", {}
         )
         if not job.run():
-            raise InputError("stopped; rows measured so far are kept, and the same command continues with the next")
+            raise InputError(
+                "stopped; the rows measured so far are kept, and the same command continues with the next row"
+            )
     found = validate(trainee.best_model(), scenes.to(device))
     return {"without": choice.without, **{k: float(f"{found[k]:.4g}") for k in METRICS}, "scenes": len(scenes),
             "frames": _frames(scenes), "minutes": float(f"{trainee.elapsed / 60:.3g}"),
@@ -85,9 +87,11 @@ def _before(out: Path, options: dict) -> dict | None:
         facts = json.loads(out.read_text())
         same, _ = facts["options"] == options, facts["rows"].items()
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{out}: holds no results of `ngff-lab bench ablation` ({error!r}); name another") from error
+        raise InputError(
+            f"{out}: contains no results of `ngff-lab bench ablation` ({error!r}); name another file"
+        ) from error
     if not same:
-        raise InputError(f"{out}: was measured with {facts['options']}; take the same options, or another file")
+        raise InputError(f"{out}: was measured with {facts['options']}; use the same options, or name another file")
     return facts
 
 

@@ -65,9 +65,9 @@ def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterato
     Raises InputError if there are no photo sets or no NVIDIA GPU.
     """
     if not sets:
-        raise InputError("name one or more photo sets: a folder of photos, or one with images/")
+        raise InputError("PHOTOSET is missing: name one or more folders of photos, or folders that contain images/")
     if pick_device("auto") != "cuda":
-        raise InputError("gsplat needs an NVIDIA GPU, and PyTorch finds none (see `ngff-lab doctor`)")
+        raise InputError("gsplat needs an NVIDIA GPU, but PyTorch finds none (see `ngff-lab doctor`)")
     folders = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = earlier_results(out, "sets")
     yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo held out"

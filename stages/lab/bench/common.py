@@ -91,7 +91,9 @@ def earlier_results(out: Path, key: str) -> dict:
         found = json.loads(out.read_text())[key]
         return dict(found.items())
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{out}: holds no results of this benchmark ({reason(error)}); name another file") from error
+        raise InputError(
+            f"{out}: contains no results of this benchmark ({reason(error)}); name another file"
+        ) from error
 
 
 def write_json(out: Path, facts: Mapping) -> None:

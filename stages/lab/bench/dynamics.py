@@ -72,7 +72,9 @@ def redraw(results: Path) -> list[str]:
         report(Path(results), facts)
         return table(facts)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{results}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
+        raise InputError(
+            f"{results}: contains no results of `ngff-lab bench dynamics` ({error!r}); name another file"
+        ) from error
 
 
 def run(
@@ -90,7 +92,7 @@ def run(
     """
     files = sorted(Path(folder).glob("*.safetensors"), key=lambda f: (f.stem == "ngff", f.stem))  # our model last
     if not files:
-        raise InputError(f"{folder}: holds no weights (.safetensors); make some with `ngff-lab train`")
+        raise InputError(f"{folder}: contains no weights (.safetensors); train some with `ngff-lab train`")
     before = _earlier(Path(out))
     device = pick_device(options.device)
     splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _groups_exist(data, name)}
@@ -133,14 +135,16 @@ def _earlier(out: Path) -> dict:
         before = json.loads(out.read_text())
         return {key: before[key] for key in ("rows", *COMPARABLE_KEYS)}
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{out}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
+        raise InputError(
+            f"{out}: contains no results of `ngff-lab bench dynamics` ({error!r}); name another file"
+        ) from error
 
 
 def _groups_exist(data: Path, split: str) -> bool:
     """Whether all groups of a split exist; logs a warning if not."""
     missing = [g for g in SPLITS[split][0] if not (motions_folder(data) / f"{g}.h5").is_file()]
     if missing:
-        log.warning("%s is not measured: %s has no %s", split, data, ", ".join(missing))
+        log.warning("split %s is not measured, as %s has no %s", split, data, ", ".join(missing))
     return not missing
 
 
@@ -171,7 +175,7 @@ def _compared(made: KeypointMotions, motions: KeypointMotions, batch: int) -> di
     """Metrics of scenes from another simulation; scenes that failed in it are counted and left out."""
     both = shared_scenes(motions, made)
     if not len(both):
-        raise InputError("the two data sets have no scene in common by name")
+        raise InputError("the two data sets have no scene of the same name; use data sets of the same scenes")
     return {**evaluate_predictor(predict_from(made, motions.points.shape[1]), both, batch), "scenes left out":
             len(motions) - len(both)}  # fmt: skip
 

@@ -79,7 +79,10 @@ def predict_from(made: KeypointMotions, frames: int) -> Predict:
     def predict(some: KeypointMotions) -> Tensor:
         _, t, o, n, _ = some.points.shape
         if made.points.shape[1] < frames or made.points.shape[2] < o or made.points.shape[3] < n:
-            raise InputError(f"{some.names[0]}: has fewer frames, objects or keypoints in the other data set")
+            raise InputError(
+                f"{some.names[0]}: has fewer frames, objects or keypoints in the other data set; "
+                "generate both with the same options"
+            )
         return made.points[[row[name] for name in some.names], :t, :o, :n].to(some.points)
 
     return predict
@@ -109,7 +112,8 @@ class Resimulation:
                 continue
             if _options(motions_folder(data) / f"{group}.h5") != made:
                 raise InputError(
-                    f"{data}: {group} and {groups[0]} were simulated with different discretisations; use one for both"
+                    f"{data}: {group} and {groups[0]} were simulated with different discretisations; generate "
+                    "both with the same one"
                 )
             self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
         given = Discretisation(made["dx"], made["spacing"], made["substep"])
@@ -134,7 +138,9 @@ class Resimulation:
 
     def _config(self, name: str) -> SceneConfig:
         if name not in self.configs:
-            raise InputError(f"{name}: no such scene in scene_configs; make configurations and motions together")
+            raise InputError(
+                f"{name}: there is no such scene in scene_configs; generate configurations and motions together"
+            )
         return self.configs[name]
 
 
@@ -145,5 +151,5 @@ def _options(path: Path) -> dict:
     try:
         return {k: options[k] for k in ("dx", "spacing", "substep", "keypoints")}
     except KeyError as error:
-        raise InputError(f"{path}: has no record of how it was simulated (no {error.args[0]}); leave mpm-estimated "
-                         "out with --mpm 0, or make the data again") from error  # fmt: skip
+        raise InputError(f"{path}: does not record how it was simulated (no {error.args[0]}); leave mpm-estimated "
+                         "out with --mpm 0, or generate the data again") from error  # fmt: skip

@@ -48,7 +48,7 @@ def run(video: Path, out: Path, options: EstimateOptions) -> list[str]:
     endpoint = ChatEndpoint.from_environment(options.model, options.timeout)
     names = object_names(options.objects)
     jpegs = sample_frames(video, options.frames, options.longest)
-    log.info("showing %d frames of %s to %s at %s", len(jpegs), video, endpoint.model, endpoint.url)
+    log.info("sending %d frames of %s to %s at %s", len(jpegs), video, endpoint.model, endpoint.url)
     found, replies = estimate(endpoint, jpegs, names, options.tries)
     with replacing(out) as part:
         rows = {name: {k: row[k] for k in ("E", "density")} for name, row in found.items()}
@@ -65,7 +65,9 @@ def object_names(objects: str) -> list[str]:
     if objects.lower().endswith(".ply"):
         names = [o.name for o in read_scene(Path(objects)).objects]
         if not names:
-            raise InputError(f"{objects}: has no objects yet; label them with `ngff segment` or write names")
+            raise InputError(
+                f"{objects}: has no labelled objects; label them with `ngff segment`, or give names of objects"
+            )
     else:
         names = [name.strip() for name in objects.split(",") if name.strip()]
     twice = {name for name in names if names.count(name) > 1}

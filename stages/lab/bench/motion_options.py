@@ -17,12 +17,14 @@ FILM_KINDS = ("slide", "throw")
 class PhysicsBenchOptions:
     """Which experiments are run, with which engines."""
 
-    only: str = option("", "experiments by group or pattern, such as slide,'boxes/0.3m*'; default: all")
-    engines: tuple[str, ...] = option(("rigid", "mpm", "ngff"), "auto | rigid | mpm | ngff; repeatable", "--engine")
-    quality: str = option("draft", "quality of MPM: draft | normal | high")
-    keypoints: int = option(256, "keypoints per object", min=8)
-    weights: Path | None = option(None, "weights of the learned engine; default: those in the package")
-    contact: str = option(AUTO, "contacts of the engine ngff: auto | learned | solved")
+    only: str = option("", "experiments to run, by group or pattern, such as slide,'boxes/0.3m*'; default: all")
+    engines: tuple[str, ...] = option(
+        ("rigid", "mpm", "ngff"), "engine to measure: auto | rigid | mpm | ngff; repeatable", "--engine"
+    )
+    quality: str = option("draft", "quality of engine mpm: draft | normal | high")
+    keypoints: int = option(256, "number of keypoints per object", min=8)
+    weights: Path | None = option(None, "weights of the learned engine; default: the weights in the package")
+    contact: str = option(AUTO, "contacts of engine ngff: auto | learned | solved")
     device: str = device_option()
 
     def __post_init__(self):
@@ -36,29 +38,33 @@ class PhysicsBenchOptions:
 class DynamicsBenchOptions:
     """Scenes, keypoints and the optional MPM row."""
 
-    keypoints: int = option(256, "keypoints per object")
-    limit: int = option(0, "scenes of each split; 0: all")
-    mpm: int = option(100, "scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
+    keypoints: int = option(256, "number of keypoints per object")
+    limit: int = option(0, "number of scenes of each split; 0: all")
+    mpm: int = option(
+        100, "number of scenes of each split that are simulated for the row mpm-estimated; 0: omit the row"
+    )
     batch: int = 100  # scenes evaluated together
     seed: int = 0  # selects the scenes of the temporal split
     device: str = device_option()
 
     def __post_init__(self):
         if self.keypoints < 1 or self.batch < 1 or min(self.limit, self.mpm) < 0:
-            raise InputError("--keypoints must be positive, --limit and --mpm at least 0")
+            raise InputError(
+                "--keypoints, --limit and --mpm: --keypoints must be positive, --limit and --mpm at least 0"
+            )
 
 
 @dataclass(frozen=True)
 class AblationBenchOptions:
     """Length and data of each training."""
 
-    steps: int = option(1500, "training steps of each ablation", min=1)
-    batch: int = option(64, "scenes per training step", min=1)
-    keypoints: int = option(256, "keypoints per object", min=1)
+    steps: int = option(1500, "number of training steps of each ablation", min=1)
+    batch: int = option(64, "number of scenes per training step", min=1)
+    keypoints: int = option(256, "number of keypoints per object", min=1)
     horizons: str = option("8,20", "rollout length of each training phase [frames]")
     groups: str = option("3_0..3_8", "groups of scenes to train on")
     test: str = option("3_9", "group of scenes to test on")
-    compiled: bool = option(False, "compile the training step first; for GPUs")
+    compiled: bool = option(False, "compile the training step first (only useful on GPUs)")
     seed: int = seed_option()
     device: str = device_option()
 
@@ -70,10 +76,10 @@ class TrackBenchOptions:
     sequences: int = option(5, "number of sequences")
     first: int = option(0, "seed of the first sequence", min=0)
     width: int = option(240, "width of the videos [px]")
-    frames: int = option(50, "frames of motion")
+    frames: int = option(50, "number of frames of motion")
     quality: str = option(
         "",
-        "track scenes reconstructed from the videos at this quality and segmented; default: true scenes",
+        "track in scenes that are reconstructed from the videos at this quality and segmented; default: in true scenes",
         "--reconstructed",
     )
     device: str = device_option()
@@ -90,12 +96,12 @@ class FitBenchOptions:
     """Scenes, and how each is fitted."""
 
     scenes: int = option(20, "number of scenes", min=1)
-    only: str = option("", "some of slide,bounce,collision,soft, alternating; default: all four")
-    truth: str = option("", "engine of the motions; default: that which fits them")
-    noise: float = option(0.002, "standard deviation of the tracks' errors [m]", min=0)
-    evaluations: int = option(1500, "largest number of simulations of a scene", min=1)
-    minutes: float = option(10.0, "longest time of a scene [min]", min=0)
-    workers: int = option(2, "processes", min=1)
+    only: str = option("", "kinds of motion, which alternate: some of slide,bounce,collision,soft; default: all four")
+    truth: str = option("", "engine that generates the motions; default: the engine suited to each kind")
+    noise: float = option(0.002, "standard deviation of the errors of the tracks [m]", min=0)
+    evaluations: int = option(1500, "maximum number of simulations per scene", min=1)
+    minutes: float = option(10.0, "maximum time per scene [min]", min=0)
+    workers: int = option(2, "number of processes", min=1)
     seed: int = seed_option()
     device: str = device_option()
 
@@ -110,11 +116,11 @@ class FilmBenchOptions:
     """What is filmed, and how it is fitted."""
 
     scenes: int = option(6, "number of scenes")
-    only: str = option("", "slide or throw; default: both, alternating")
-    films: int = option(2, "films per scene")
+    only: str = option("", "kind of motion: slide or throw; default: both, alternating")
+    films: int = option(2, "number of films per scene")
     width: int = option(320, "width of the films [px]")
-    frames: int = option(25, "frames of each film")
-    workers: int = option(2, "processes", min=1)
+    frames: int = option(25, "number of frames of each film")
+    workers: int = option(2, "number of processes", min=1)
     seed: int = seed_option()
     device: str = device_option()
 
@@ -128,7 +134,7 @@ class FilmBenchOptions:
 class ReplayOptions:
     """Length and device of the run."""
 
-    frames: int = option(0, "number of frames; 0: all of the recording")
+    frames: int = option(0, "number of frames to simulate; 0: all frames of the recording")
     device: str = device_option()
 
     def __post_init__(self):
@@ -140,9 +146,11 @@ class ReplayOptions:
 class EstimateOptions:
     """Model, frames shown, and number of attempts."""
 
-    objects: str = option("", "names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
+    objects: str = option(
+        "", "names of the objects, such as duck,ball, or a labelled scene.ply; default: chosen by the model"
+    )
     model: str = option("", "name of a model that accepts images; default: $OPENAI_MODEL")
-    timeout: float = option(120.0, "maximum waiting time for a reply [s]")
+    timeout: float = option(120.0, "maximum waiting time for an answer [s]")
     frames: int = 10  # number of frames shown, evenly spaced
     longest: int = 512  # longest side of a frame as sent [px]
     tries: int = 3  # maximum number of replies

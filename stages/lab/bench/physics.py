@@ -35,7 +35,7 @@ def chosen(only: str) -> list[Experiment]:
     for pattern in patterns:
         if not any(_fits(name, pattern) for name in table):
             groups = ", ".join(sorted({name.partition("/")[0] for name in table}))
-            raise InputError(f"--only {pattern}: fits no experiment; groups are {groups}")
+            raise InputError(f"--only {pattern}: matches no experiment; the groups are {groups}")
     return [e for name, e in table.items() if not patterns or any(_fits(name, p) for p in patterns)]
 
 
@@ -95,7 +95,7 @@ def run(out: Path, options: PhysicsBenchOptions) -> Iterator[str]:
                                     "contact": options.contact}  # fmt: skip
     for name, default in (("quality", None), ("contact", "learned")):  # defaults for tables of older versions
         if (before := facts.get(name, default)) != getattr(options, name):
-            raise InputError(f"{out}: has rows measured at --{name} {before}; name another file (-o)")
+            raise InputError(f"{out}: contains rows measured with --{name} {before}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}
     for experiment in chosen(options.only):
         row = facts["rows"].setdefault(experiment.name, {})
@@ -121,7 +121,9 @@ def _before(out: Path) -> dict | None:
         facts = json.loads(out.read_text())
         facts["rows"].items()
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{out}: holds no results of `ngff-lab bench physics` ({error!r}); name another") from error
+        raise InputError(
+            f"{out}: contains no results of `ngff-lab bench physics` ({error!r}); name another file"
+        ) from error
     return facts
 
 

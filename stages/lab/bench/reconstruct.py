@@ -48,7 +48,9 @@ def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterat
     The row of a set that cannot be reconstructed holds the error message.
     """
     if not sets:
-        raise InputError("name one or more photo sets: a folder with images/ and, if there are any, cameras.json")
+        raise InputError(
+            "PHOTOSET is missing: name one or more folders that contain images/ and, if known, cameras.json"
+        )
     photos = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = earlier_results(out, "sets")
     yield f"{'set':14s} {'photos':7s} {'rotation':>9s} {'shift':>7s} {'held-out':>19s} {'wall':>6s} {'CPU':>8s}  memory"
@@ -81,7 +83,7 @@ def photo_folder(folder: Path) -> Path:
         if (folder / name).is_dir():
             return folder / name
     if not folder.exists():
-        raise InputError(f"{folder}: no such folder; give a photo set")
+        raise InputError(f"{folder}: there is no such folder; give the folder of a photo set")
     return folder
 
 
@@ -177,7 +179,9 @@ def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Camera
     row = {name: i for i, name in enumerate(reference.names)}
     both = [name for name in found.names if name in row]
     if len(both) < 3:
-        raise InputError(f"the reference cameras name {len(both)} of the photos; 3 or more are needed to compare")
+        raise InputError(
+            f"the reference cameras include {len(both)} of the photos; at least 3 are needed for a comparison"
+        )
     return found[[found.names.index(name) for name in both]], reference[[row[name] for name in both]]
 
 

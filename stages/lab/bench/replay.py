@@ -49,7 +49,7 @@ def read_recording(path: Path) -> dict[str, np.ndarray]:
     if missing := sorted(RECORDING_FIELDS - data.keys()):
         raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(RECORDING_FIELDS))}")
     if data["n"].ndim != 1 or data["n"].dtype.kind not in "iu" or not ((data["n"] > 0) & (data["n"] < 1 << 31)).all():
-        raise InputError(f"{path}: n must be a list of numbers of particles above 0")
+        raise InputError(f"{path}: n must be a list of positive numbers of particles")
     shape, p = data["positions"].shape, int(data["n"].sum())
     if len(shape) != 3 or shape[1:] != (p, 3) or not shape[0]:
         raise InputError(f"{path}: positions must be (frames, {p}, 3), to match n, not {shape}")
@@ -105,7 +105,7 @@ def compare(data: dict[str, np.ndarray], ours: Tensor) -> ReplayErrors:
     com = torch.stack([b.mean(1) for b in bodies], 1)
     drop = float((com[0, :, 2] - com[:, :, 2]).max())
     if drop <= 0:
-        raise InputError("nothing falls in this recording")
+        raise InputError("the recording shows no fall; give one in which the particles fall")
     dt = float(data["dt"])
     steps = torch.arange(len(com)).double() * int(data["substeps_per_frame"])
     # the public solver adds gravity before moving particles: after s substeps they have fallen g dt^2 s (s + 1) / 2
@@ -135,7 +135,7 @@ def run(recording: Path, out: Path, options: ReplayOptions) -> Iterator[str]:
     data = read_recording(recording)
     frames = options.frames or len(data["positions"])
     if frames > len(data["positions"]):
-        raise InputError(f"--frames {frames}: {recording} has {len(data['positions'])}")
+        raise InputError(f"--frames {frames}: {recording} has {len(data['positions'])} frames; give fewer")
     states = simulate(data, frames, pick_device(options.device))
     ours = torch.stack(list(tqdm(states, total=frames, unit="frame")))
     with replacing(out) as part:

@@ -14,10 +14,10 @@ from stages.reconstruct.options import ReconstructOptions
 class ReconstructBenchOptions:
     """Quality and parts of the reconstruction."""
 
-    quality: str = option("normal", "quality of the reconstruction")
-    holdout: int = option(8, "hold out every N-th photo", min=0)
+    quality: str = option("normal", "quality of the reconstruction: draft | normal | high")
+    holdout: int = option(8, "hold out every N-th photo for evaluation", min=0)
     device: str = device_option()
-    matcher: str = option("sift", "features matched between photos: sift | aliked-lightglue")
+    matcher: str = option("sift", "features that are matched between photos: sift | aliked-lightglue")
     cameras_only: bool = option(False, "stop after the cameras are estimated, to compare matchers")
 
     def key(self, folder: Path) -> str:
@@ -31,9 +31,9 @@ class ReconstructBenchOptions:
 class AppearanceBenchOptions:
     """Quality of the reconstruction, and its held-out photos."""
 
-    quality: str = option("high", "quality of the reconstruction")
-    holdout: int = option(8, "hold out every N-th photo")
-    models: Path | None = option(None, "folder in which cameras and sparse points are cached between runs")
+    quality: str = option("high", "quality of the reconstruction: draft | normal | high")
+    holdout: int = option(8, "hold out every N-th photo for evaluation")
+    models: Path | None = option(None, "folder that caches cameras and sparse points between runs")
 
     def __post_init__(self):
         if self.holdout < 2:
@@ -49,15 +49,19 @@ class AppearanceBenchOptions:
 class SegmentBenchOptions:
     """Scenes and methods; two scenes together show all ten objects."""
 
-    scenes: int = option(4, "scenes of each kind: separate objects, and objects in contact")
+    scenes: int = option(4, "number of scenes of each kind (separate objects, and objects in contact)")
     views: int = option(24, "number of cameras per scene")
-    weights: Path | None = option(None, "weights of network backends; default: searched; without any, they are skipped")
+    weights: Path | None = option(
+        None, "weights of network backends; default: searched; backends without weights are skipped"
+    )
     device: str = device_option()
-    reconstruct: bool = option(False, "also segment scenes reconstructed from photos, by geometry and by the network")
+    reconstruct: bool = option(
+        False, "also segment scenes that are reconstructed from photos, by geometry and by the network"
+    )
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
-            raise InputError("--scenes 1 to 100, --views 8 to 200")
+            raise InputError("--scenes and --views: give 1 to 100 scenes and 8 to 200 views")
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,12 @@ class SegmentPhotosOptions:
     """Locations of label images and of scenes that are already segmented."""
 
     labels: Path | None = option(
-        None, "of photo sets: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
+        None,
+        "for photo sets: folder of label images, or folder of such folders named like the sets; default: "
+        "PHOTOSET/labels",
     )
     labelled: Path | None = option(
-        None, "of photo sets: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"
+        None, "for photo sets: folder of labelled scenes PHOTOSET.ply; missing scenes are generated and kept there"
     )
     device: str = device_option()
 
@@ -77,10 +83,10 @@ class SegmentPhotosOptions:
 class SegmentAblationOptions:
     """Length and batch size of each training."""
 
-    steps: int = option(1500, "training steps of each network", min=1)
+    steps: int = option(1500, "number of training steps of each network", min=1)
     voxels: int = 14_000  # per crop
-    batch: int = option(4, "crops per step", min=1)
-    workers: int = option(0, "processes that prepare crops; 0: the training process itself", min=0)
+    batch: int = option(4, "number of crops per step", min=1)
+    workers: int = option(0, "number of processes that prepare crops; 0: the training process itself", min=0)
     seed: int = seed_option()
     device: str = device_option()
 
@@ -103,15 +109,15 @@ class RefineBenchOptions:
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
-            raise InputError("--scenes 1 to 100, --views 8 to 200")
+            raise InputError("--scenes and --views: give 1 to 100 scenes and 8 to 200 views")
 
 
 @dataclass(frozen=True)
 class RegisterBenchOptions:
     """Objects, number of trials and the damage to each part."""
 
-    only: str = option("", "names of the objects, such as ball,duck; default: all ten")
-    trials: int = option(10, "partial views of each object", min=1)
+    only: str = option("", "names of the objects to register, such as ball,duck; default: all ten")
+    trials: int = option(10, "number of partial views of each object", min=1)
     missing: float = 0.4  # fraction of the surface that is removed
     noise: float = 0.01  # standard deviation of the noise of positions [diameters]
     tint: float = 0.02  # standard deviation of the noise of colours [0..1]

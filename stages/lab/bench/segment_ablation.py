@@ -150,7 +150,7 @@ def _examples(folders: Sequence[Path], observation: str) -> list[Path]:
     name = OBSERVED.format(observation)
     files = [file for file in find_examples(folders) if file.name == name]
     if not files:
-        raise InputError(f"{folders[0]}: no scene has {name}; make it with `ngff-lab clutter "
+        raise InputError(f"{folders[0]}: no scene contains {name}; generate it with `ngff-lab clutter "
                          f"--{'exact' if observation == EXACT else 'reconstruct'}`")  # fmt: skip
     return files
 

@@ -59,7 +59,7 @@ def labels_of(folder: Path, options: SegmentPhotosOptions) -> Path:
     places = [folder / "labels"] if given is None else [Path(given) / folder.resolve().name, Path(given)]
     found = next((place for place in places if (place / "names.json").exists()), None)
     if found is None:
-        raise InputError(f"{places[0]}: holds no names.json; give the folder of the label images with --labels")
+        raise InputError(f"{places[0]}: contains no names.json; give the folder of the label images with --labels")
     return found
 
 

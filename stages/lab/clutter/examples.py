@@ -55,5 +55,5 @@ def read_example(path: Path) -> Example:
         if labels.is_floating_point() or not all(x.isfinite().all() for x in points.values()):
             raise ValueError("its labels are not whole numbers, or a value is not finite")
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise InputError(f"{path}: is not an example of clutter ({reason(error)}); make it again") from error
+        raise InputError(f"{path}: is not an example of clutter ({reason(error)}); generate it again") from error
     return Example(ScenePoints(**points), labels.to(torch.int64))

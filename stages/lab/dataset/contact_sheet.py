@@ -47,7 +47,7 @@ class SheetOptions:
 
     def __post_init__(self):
         if not 1 <= self.count <= 40:
-            raise InputError(f"--scenes {self.count}: a sheet has 1 to 40 rows")
+            raise InputError(f"--scenes {self.count}: give 1 to 40 rows")
 
 
 def write_sheet(data: Path, out: Path, options: SheetOptions) -> None:
@@ -58,7 +58,8 @@ def write_sheet(data: Path, out: Path, options: SheetOptions) -> None:
     layout, device = Layout(Path(data)), pick_device(options.device)
     groups = [g for g in options.groups if layout.motions(g).is_file()]
     if not groups:
-        raise InputError(f"{data}: has none of {', '.join(options.groups)} (motions/*.h5); make them with `ngff-lab "
+        raise InputError(f"{data}: contains none of {', '.join(options.groups)} (motions/*.h5); generate them "
+                         "with `ngff-lab "
                          "dataset`")  # fmt: skip
     images = []
     object_gaussians = cache(lambda name: _object_gaussians(layout, name))

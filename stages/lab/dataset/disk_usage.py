@@ -93,7 +93,7 @@ def require_disk_space(root: Path, parts: dict[str, float]) -> None:
     missing = ", ".join(f"{part} {format_bytes(size)}" for part, size in parts.items() if size)
     print(f"{root}: about {format_bytes(total)} to write ({missing}), {format_bytes(free)} free", flush=True)
     if total > MAX_DISK_FRACTION * free:
-        raise InputError(f"{root}: about {format_bytes(total)} are needed but {format_bytes(free)} are free; choose "
+        raise InputError(f"{root}: about {format_bytes(total)} are needed, but {format_bytes(free)} are free; choose "
                          "fewer --parts, --groups, --views or --backgrounds, or a larger disk")  # fmt: skip
 
 

@@ -152,7 +152,7 @@ def _sample_points(
 ) -> Float[Tensor, "p 3"]:
     """A subset of the points, chosen by farthest-point sampling."""
     if len(points) < min_particles:
-        raise InputError(f"--keypoints {min_particles}: an object has only {len(points)} surface points")
+        raise InputError(f"--keypoints {min_particles}: an object has only {len(points)} surface points; give fewer")
     count = min(len(points), max(min_particles, count_for_spacing(points, discretisation.spacing)))
     with single_threaded():
         return points[farthest_points(points, count)]

@@ -126,7 +126,9 @@ class DatasetGenerator:
         if path.exists():
             limit = read_provenance(path).get("options", {}).get("limit", 0)
             if limit != o.limit:
-                raise InputError(f"{path}: was made with --limit {limit}, not {o.limit}; remove it to make it again")
+                raise InputError(
+                    f"{path}: was generated with --limit {limit}, not {o.limit}; remove it to generate it again"
+                )
             return
         path.parent.mkdir(exist_ok=True)
         configs, start, count = self._configs(group), time.perf_counter(), 0

@@ -78,7 +78,9 @@ def frame_files(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: is not a folder; give mpm/<group>/<scene> of the data set")
     frames = sorted(p for p in folder.glob("*.h5") if p.stem.isdigit())
     if not frames:
-        raise InputError(f"{folder}: has no frames 0000.h5, 0001.h5, ...; give mpm/<group>/<scene> of the data set")
+        raise InputError(
+            f"{folder}: contains no frames 0000.h5, 0001.h5, ...; give mpm/<group>/<scene> of the data set"
+        )
     gap = next((i for i, p in enumerate(frames) if int(p.stem) != i), None)
     if gap is not None:
         raise InputError(
@@ -127,7 +129,7 @@ def _gaussian_count(layout: Layout, name: str) -> int:
     try:
         return PlyData.read(str(path), mmap="r")["vertex"].count
     except (PlyParseError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
+        raise InputError(f"{path}: cannot be read ({error}); download it again") from error
 
 
 def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
@@ -142,7 +144,8 @@ def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
         )
     distance = float((positions - g.means[rows]).abs().amax())
     if not distance <= POSITION_TOLERANCE:
-        raise InputError(f"{first}: rows start up to {distance:.3g} m from the Gaussians of {source}; give the scene "
+        raise InputError(f"{first}: its rows start up to {distance:.3g} m away from the Gaussians of {source}; "
+                         "give the scene "
                          "that the frames were made from as --scene")  # fmt: skip
     return rows
 
@@ -150,7 +153,7 @@ def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
 def _choose_keypoints(scene: Scene, rows: Int[Tensor, "r"], count: int) -> tuple[Int[Tensor, "k"], Keypoints]:
     """Evenly distributed rows of each object, and the keypoints at their rest positions."""
     if count < 1:
-        raise InputError(f"--keypoints {count}: at least 1 per object")
+        raise InputError(f"--keypoints {count}: give at least 1 per object")
     g, chosen = scene.gaussians, []
     for o in scene.objects:
         own = (g.object_id[rows] == o.id).nonzero()[:, 0]
@@ -163,7 +166,7 @@ def _read_positions(frames: list[Path], count: int) -> Iterator[Float[Tensor, "r
     for path in tqdm(frames, unit="frame"):
         positions = read_frame(path, "pos", (3,))
         if len(positions) != count:
-            raise InputError(f"{path}: has {len(positions)} rows and the first frame {count}; download it again")
+            raise InputError(f"{path}: has {len(positions)} rows, but the first frame has {count}; download it again")
         yield positions
 
 

@@ -227,16 +227,19 @@ def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> KeypointM
     folder = motions_folder(folder)
     missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]
     if missing:
-        raise InputError(f"{folder}: there is no {', '.join(missing)}; make the groups with `ngff-lab dataset`, or "
-                         "name those that are there")  # fmt: skip
+        raise InputError(f"{folder}: there is no {', '.join(missing)}; generate the groups with `ngff-lab dataset`, or "
+                         "name existing groups")  # fmt: skip
     parts = []
     for name in names:
         part = read_motions(folder / f"{name}.h5")
         if part.points.shape[3] < keypoints:
-            raise InputError(f"{folder / name}.h5: has {part.points.shape[3]} keypoints an object; ask for no "
-                             f"more, not {keypoints}")  # fmt: skip
+            raise InputError(f"{folder / name}.h5: has {part.points.shape[3]} keypoints per object; give at "
+                             f"most as many, not {keypoints}")  # fmt: skip
         parts.append(replace(part, points=part.points[:, :, :, :keypoints].clone()))
     odd = next((n for n, p in zip(names, parts, strict=True) if p.points.shape[1] != parts[0].points.shape[1]), None)
     if odd:
-        raise InputError(f"{folder / odd}.h5: has another number of frames than {names[0]}.h5; use groups of one kind")
+        raise InputError(
+            f"{folder / odd}.h5: has a different number of frames than {names[0]}.h5; use groups "
+            "with the same number of frames"
+        )
     return concatenate_motions(parts)

@@ -33,7 +33,7 @@ def open_manifest(root: Path, settings: dict) -> None:
             content = read_json(path)
             existing = {"settings": content["settings"], "solver": content["solver"]}
         except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: cannot be read ({error!r}); is {root} a data set?") from error
+            raise InputError(f"{path}: cannot be read ({error!r}); check that {root} is a data set") from error
         _require_equal(root, existing, current)
         return
     versions = {"ngff": ngff_version(), "python": platform.python_version(),
@@ -56,7 +56,7 @@ def _require_equal(root: Path, existing: dict, current: dict) -> None:
     different = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     if different:
         values = ", ".join(f"{n} {old.get(n)}, not {new.get(n)}" for n in different)
-        raise InputError(f"{root}: was started with {values}; use the same settings, or another folder")
+        raise InputError(f"{root}: was started with {values}; use the same options, or another folder")
     if existing["solver"] != current["solver"]:
         raise InputError(f"{root}: was started with another version of the solver; use that version, or another folder")
 
@@ -98,7 +98,10 @@ def verify_files(root: Path) -> int:
     """
     lists = sorted((root / "sums").glob("*.sha256"))
     if not lists:
-        raise InputError(f"{root}: has no sums/*.sha256; it is not a data set of `ngff-lab dataset`, or incomplete")
+        raise InputError(
+            f"{root}: has no sums/*.sha256; it is not a data set of `ngff-lab dataset`, or is "
+            "incomplete; generate it first"
+        )
     listed = {name: digest for path in lists for name, digest in read_checksums(path).items()}
     problems = []
     for name, digest in tqdm(listed.items(), desc="check", unit="file"):

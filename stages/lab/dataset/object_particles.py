@@ -93,7 +93,10 @@ def cached_points(
         arrays = read_npz(cache, "particles of objects, which are made again where there is no such file")
         if str(arrays.pop("key", "")) == key and {*names} <= set(arrays):
             if any(arrays[n].shape[1:] != (3,) or arrays[n].dtype.kind != "f" for n in names):
-                raise InputError(f"{cache}: an object's particles are not (particles, 3); remove it to make it again")
+                raise InputError(
+                    f"{cache}: the particles of an object do not have the shape (particles, 3); "
+                    "remove the file to generate it again"
+                )
             return {name: torch.from_numpy(arrays[name]) for name in names}
     points = sample()
     if cache is not None:
@@ -114,7 +117,7 @@ def _sample_particles(kind: ObjectKind, discretisation: Discretisation, min_part
     g = at_scale_prior(make_object(kind.name), kind.scale)
     means = g.means[g.opacities > MIN_PARTICLE_OPACITY]
     if len(means) < min_particles:
-        raise InputError(f"--keypoints {min_particles}: {kind.name} has only {len(means)} Gaussians")
+        raise InputError(f"--keypoints {min_particles}: {kind.name} has only {len(means)} Gaussians; give fewer")
     count = max(min_particles, count_for_spacing(means, discretisation.spacing))
     with single_threaded():  # ten times faster: threads would synchronise once per sampled point
         return means[farthest_points(means, count)]

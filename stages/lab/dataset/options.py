@@ -32,10 +32,10 @@ MAX_NUDGE = 0.02  # largest shift of an object [m]; scenes leave 0.05 m between 
 class Discretisation:
     """Resolution of the simulation in space and time. Raises InputError for values out of range."""
 
-    dx: float = option(0.02, "grid spacing [m]; published: 0.02")
-    spacing: float = option(0.009, "spacing of particles on a surface [m]")
+    dx: float = option(0.02, "grid spacing of the simulation [m]; published: 0.02")
+    spacing: float = option(0.009, "spacing of particles on surfaces [m]")
     substep: float = option(
-        SUBSTEP, "longest simulation time step [s], shortened for stiff light objects; published: 1e-4"
+        SUBSTEP, "longest simulation time step [s], which is shortened for stiff, light objects; published: 1e-4"
     )
 
     def __post_init__(self):
@@ -43,7 +43,7 @@ class Discretisation:
             ("dx", MIN_DX, 0.2, "m"), ("spacing", 1e-6, 0.2, "m"), ("substep", 1e-7, FRAME_INTERVAL, "s")
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
-                raise InputError(f"--{name} {getattr(self, name):g}: from {low:g} to {high:g} {unit}")
+                raise InputError(f"--{name} {getattr(self, name):g}: must be from {low:g} to {high:g} {unit}")
 
     @property
     def substeps(self) -> int:
@@ -55,23 +55,27 @@ class Discretisation:
 class DatasetOptions(Discretisation):
     """Groups to generate, and the settings that determine their content."""
 
-    groups: str = option("3_0..3_9,4,6", "groups of scenes; more_0..more_9 are further scenes of three objects")
+    groups: str = option(
+        "3_0..3_9,4,6", "groups of scenes to generate; more_0..more_9 are additional scenes of three objects"
+    )
     parts: str = option(
         "motions",
         "what to generate, separated by commas: motions, scenes, mpm, initial, dynamic, objects, "
         "backgrounds, scene_configs",
     )
-    frames: int = option(100, "frames per scene, of 0.02 s each")
-    keypoints: int = option(2048, "keypoints per object in motions")
-    nudge: float = option(0.0, "shift of each object's initial position [m]; see `statistics --against`")
-    exact: bool = option(
-        False, "bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic"
+    frames: int = option(100, "number of frames per scene, of 0.02 s each")
+    keypoints: int = option(2048, "number of keypoints per object in motions")
+    nudge: float = option(
+        0.0, "distance by which each object's initial position is shifted [m]; see `statistics --against`"
     )
-    views: str = option("all", "views of the videos: some of 0,4,...,96, or all")
-    backgrounds: str = option("all", "backgrounds of the videos: some of table0,...,table7, or all")
+    exact: bool = option(
+        False, "make results on a GPU bitwise reproducible, in twice the time; always on for mpm and dynamic"
+    )
+    views: str = option("all", "views to render as videos: some of 0,4,...,96, or all")
+    backgrounds: str = option("all", "backgrounds to render in videos: some of table0,...,table7, or all")
     resolution: int = option(448, "side of the videos [px]")
-    shard: str = option("1/1", "i/n: the i-th of n equal parts of the groups")
-    limit: int = option(0, "scenes of each group; 0: all")
+    shard: str = option("1/1", "i/n: generate only the i-th of n equal parts of the list of groups")
+    limit: int = option(0, "number of scenes of each group; 0: all")
     device: str = device_option()
 
     def __post_init__(self):
@@ -81,9 +85,11 @@ class DatasetOptions(Discretisation):
         if self.frames < 1 or self.keypoints < 1 or self.limit < 0:
             raise InputError("--frames and --keypoints must be positive, --limit at least 0")
         if not 0 <= self.nudge <= MAX_NUDGE:
-            raise InputError(f"--nudge {self.nudge}: from 0 to {MAX_NUDGE} m; scenes leave 0.05 between objects")
+            raise InputError(
+                f"--nudge {self.nudge}: must be from 0 to {MAX_NUDGE} m, as scenes leave 0.05 m between objects"
+            )
         if not 16 <= self.resolution <= 4096 or self.resolution % 2:
-            raise InputError(f"--resolution {self.resolution}: an even number from 16 to 4096 pixels")
+            raise InputError(f"--resolution {self.resolution}: must be an even number from 16 to 4096 pixels")
 
     @property
     def needed_parts(self) -> tuple[str, ...]:
@@ -128,18 +134,22 @@ class HeldoutOptions(Discretisation):
     """Which objects and scenes to make, and the settings of their simulation."""
 
     scenes: int = option(100, "number of scenes")
-    objects: int = option(3, "objects per scene")
-    frames: int = option(100, "frames per scene, of 0.02 s each")
-    keypoints: int = option(2048, "keypoints per object")
-    size: float = option(0.5, "longest side of a mesh [m]")
+    objects: int = option(3, "number of objects per scene")
+    frames: int = option(100, "number of frames per scene, of 0.02 s each")
+    keypoints: int = option(2048, "number of keypoints per object")
+    size: float = option(0.5, "length to which the longest side of a mesh is scaled [m]")
     shapes: int = option(
         0,
-        "number of random objects for training, written as the group varied (with --from made of its "
-        "meshes: the group meshes); 0: none",
+        "number of random objects for training, written as the group varied (with --from: made of the given "
+        "meshes and written as the group meshes); 0: none",
     )
-    solid: bool = option(False, "fill the random objects: the group solid")
-    rotations: int = option(0, "random rotations of the ten objects for training, written as the group turned; 0: none")
-    seed: int = option(0, "of scenes and random objects; other than 0: ends the group's name", min=0)
+    solid: bool = option(False, "fill the random objects; they are written as the group solid")
+    rotations: int = option(
+        0, "number of randomly rotated copies of the ten objects for training, written as the group turned; 0: none"
+    )
+    seed: int = option(
+        0, "random seed of scenes and random objects; a seed other than 0 is appended to the group's name", min=0
+    )
     device: str = device_option()
 
     def __post_init__(self):
@@ -147,15 +157,19 @@ class HeldoutOptions(Discretisation):
         if self.frames < 1 or self.keypoints < 1:
             raise InputError("--frames and --keypoints must be positive")
         if self.scenes < 1 or not 1 <= self.objects <= 6:
-            raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
+            raise InputError(
+                f"--scenes {self.scenes} --objects {self.objects}: give at least one scene, of 1 to 6 objects"
+            )
         if not 0 <= self.shapes <= 1000:
-            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 random ones")
+            raise InputError(f"--shapes {self.shapes}: give 0 for the eight objects, or up to 1000 random objects")
         if not 0 <= self.rotations <= 1000:
-            raise InputError(f"--rotations {self.rotations}: 0 for the eight, or up to 1000 rotated objects")
+            raise InputError(
+                f"--rotations {self.rotations}: give 0 for the eight objects, or up to 1000 rotated objects"
+            )
         if self.solid and not self.shapes or self.shapes and self.rotations:
             raise InputError("--solid needs --shapes, and --rotations cannot be combined with them")
         if not 0.1 <= self.size <= 1.0:
-            raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
+            raise InputError(f"--size {self.size}: must be from 0.1 to 1 m, as objects are placed in a cube of 1.8 m")
 
     def group(self, meshes: bool) -> str:
         """Name of the group of scenes, depending on whether meshes are given."""

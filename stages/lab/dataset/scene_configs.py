@@ -95,7 +95,7 @@ def sample_scene(index: int, count: int, extents: Mapping[int, PlacementExtent])
             translation = tuple(tuple(float(v) for v in p) for p in positions)
             return SceneConfig(f"{index}_{names}", tuple(chosen), translation, tuple(extents[i].scale for i in chosen))
     raise InputError(
-        f"{count} of these objects could not be placed in a cube of {2 * HALF_EXTENT} m; take smaller ones"
+        f"{count} objects of this size could not be placed in a cube of {2 * HALF_EXTENT} m; give smaller objects"
     )
 
 
@@ -153,7 +153,7 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f"{path}: is not a file of scene configurations ({reason(error)})") from error
     if not configs:
-        raise InputError(f"{path}: holds no scene configurations")
+        raise InputError(f"{path}: contains no scene configurations; give another file")
     wrong = next((name for name in configs if not SCENE_NAME.fullmatch(name)), None)
     if wrong is not None:
         raise InputError(f"{path}: the scene name {quote(repr(wrong))} cannot be a file name; use letters, digits, "

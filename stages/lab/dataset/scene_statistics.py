@@ -153,7 +153,7 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
                 kinds.setdefault(object_kind(i).name, []).append((measured, motions.objects == i))
     if not table:
         folder = motions_folder(data)
-        raise InputError(f"{folder}: has none of {', '.join(groups)} (.h5); make them with `ngff-lab dataset`")
+        raise InputError(f"{folder}: contains none of {', '.join(groups)} (.h5); generate them with `ngff-lab dataset`")
     objects = {name: _object_summary(parts) for name, parts in sorted(kinds.items())}
     if out is not None:
         with replacing(Path(out)) as part:

@@ -45,10 +45,11 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
             truth, other = truth[chosen], other[chosen]
         rows[split] = compare_motions(_first_frames(truth, frames).to(device), _first_frames(other, frames).to(device))
         if not rows[split]["start apart"]:
-            raise InputError(f"{nudged}: its scenes of {', '.join(names)} start exactly where those of {data} do; make "
+            raise InputError(f"{nudged}: its scenes of {', '.join(names)} have the same initial positions as in "
+                             f"{data}; generate "
                              "it with `ngff-lab dataset --nudge 0.001`")  # fmt: skip
     if not rows:
-        raise InputError(f"{nudged}: has no group of scenes that {data} has too")
+        raise InputError(f"{nudged}: has no group of scenes in common with {data}; give a data set of the same groups")
     if out is not None:
         with replacing(Path(out)) as part:
             part.write_text(json.dumps({"keypoints": keypoints, "splits": rows}, indent=1) + "\n")

@@ -57,7 +57,7 @@ def stable_substep(discretisation: Discretisation, materials: Iterable[tuple[flo
     if discretisation.substep * speed <= MAX_COURANT * discretisation.dx:
         return discretisation.substep
     stable = FRAME_INTERVAL / math.ceil(FRAME_INTERVAL * mpm.substep_rate(discretisation.dx, speed))
-    log.info("a substep of %.3g s is too long for E %.3g Pa at %.4g kg/m^3; taking %.3g s",
+    log.info("a substep of %.3g s is too long for E %.3g Pa at %.4g kg/m^3; %.3g s is used instead",
              discretisation.substep, E, density, stable)  # fmt: skip
     return stable
 
@@ -120,7 +120,7 @@ def valid_scenes(scenes: Sequence[SceneConfig], batch: Batch) -> list[int]:
     """Indices of the scenes whose simulation succeeded; the others are logged. Waits for the device."""
     failures = batch.failures()
     for name, problem in failures.items():
-        log.warning("%s: %s; left out", name, problem)
+        log.warning("%s: %s; the scene is left out", name, problem)
     return [k for k, c in enumerate(scenes) if c.name not in failures]
 
 

@@ -28,8 +28,9 @@ def aligned(track: Trajectory, scene: Scene, file: Path) -> Trajectory:
     """
     prompts = read_prompts_file(track.path, file.stem, track.scene.objects)
     if replace(prompts, velocity={}):  # velocities are ignored: they are fitted
-        raise InputError(f"{track.path}: it has prompts, whose objects and directions are not those of {file}; fit the "
-                         "scene that they are about, without --align")  # fmt: skip
+        raise InputError(f"{track.path}: contains prompts, whose objects and directions refer to another scene "
+                         f"than {file}; fit the "
+                         "scene to which they refer, without --align")  # fmt: skip
     predicted, true = scene_reference_frame(file, scene), trajectory_reference_frame(track)
     similarity, how = find_alignment(predicted, true)
     pairs, matched = match_objects(predicted.transformed(similarity), true, [])

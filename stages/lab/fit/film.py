@@ -165,12 +165,12 @@ def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOp
     cameras, read = read_films(world, recordings, world.sequence.frames, options.resolution)
     frames = min(world.sequence.frames, max(int(len(film.frames) - film.start) for film in read))
     if frames < 3:
-        raise InputError(f"{films[0]}: has {max(frames, 0)} frames from the start of the motion on; motion is seen in "
+        raise InputError(f"{films[0]}: has {max(frames, 0)} frames from the start of the motion on; give a film of "
                          "three or more")  # fmt: skip
     tracker = Tracker(world, cameras, read, pick_device(options.device))
     if not shown(tracker).any():
-        raise InputError(f"{films[0]}: shows no object where {scene} has it in the first frame; the film must be of a "
-                         "camera of the scene, and start with it")  # fmt: skip
+        raise InputError(f"{films[0]}: its first frame shows no object where {scene} has one; the film must be of a "
+                         "camera of the scene, and start with the state of the scene")  # fmt: skip
     fall = torch.tensor([0.0, 0.0, -GRAVITY / world.metres_per_unit])
     track = follow(tracker, frames, fall.to(tracker.device) / world.sequence.fps**2, timed)
     for line in report(world, track):
@@ -198,7 +198,9 @@ def by_camera(world: Scene, scene: Path, films: Sequence[Path]) -> dict[str, Pat
     Raises InputError for a film that matches no camera, and for two films of one camera.
     """
     if world.cameras is None:
-        raise InputError(f"{scene}: has no cameras, so that films of it cannot be compared; fit a track of its motion")
+        raise InputError(
+            f"{scene}: has no cameras, so that it cannot be compared with films; fit a track of its motion"
+        )
     known, found = {Path(name).stem: name for name in world.cameras.names}, {}
     for film in films:
         name = known.get(film.stem)
@@ -206,7 +208,7 @@ def by_camera(world: Scene, scene: Path, films: Sequence[Path]) -> dict[str, Pat
             raise InputError(f"{film}: {scene} has no camera of this name; name the film as its camera, one of "
                              f"{', '.join(list(known)[:3])}, ...")  # fmt: skip
         if name in found:
-            raise InputError(f"{film}: {found[name]} is of the same camera; give one film of each")
+            raise InputError(f"{film}: {found[name]} is of the same camera; give one film per camera")
         found[name] = film
     return found
 
@@ -224,10 +226,10 @@ def timing(world: Scene, scene: Path, recordings: dict[str, Path], frames: int) 
         return FilmedSequence(rate, frames or MAX_FRAMES, dict.fromkeys(recordings, 0.0))
     if abs(rate - known.fps) > 1e-3 * known.fps:
         raise InputError(
-            f"{film}: has {rate:g} frames a second, but the films of {scene} have {known.fps:g}; give these"
+            f"{film}: has {rate:g} frames per second, but the films of {scene} have {known.fps:g}; give the latter"
         )
     if untimed := [path for name, path in recordings.items() if name not in known.starts]:
-        raise InputError(f"{untimed[0]}: {scene} does not say when this camera started to film; leave this film out")
+        raise InputError(f"{untimed[0]}: {scene} does not state when this camera started to film; leave this film out")
     return replace(known, frames=frames or known.frames)
 
 

@@ -80,7 +80,10 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
     check_json_output(out)
     kinds = [format_of(path, "trajectory", "video").kind for path in motion]
     if kinds.count("trajectory") and len(kinds) > 1:
-        raise InputError(f"{motion[kinds.index('trajectory')]}: a track is fitted alone; give it, or films")
+        raise InputError(
+            f"{motion[kinds.index('trajectory')]}: a track cannot be combined with other tracks or "
+            "films; give one track, or only films"
+        )
     if options.align and kinds != ["trajectory"]:
         raise InputError("--align: films are of the scene's own cameras; only a track can be aligned with it")
     if kinds == ["trajectory"]:
@@ -110,7 +113,8 @@ def solve(problem: Problem, options: MaterialFitOptions, until: float | None = N
     simulation starts after `until`, a time of `time.perf_counter` (default: --minutes from now), except the two that
     measure the outcome.
     """
-    log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
+    log.info("fitting %d parameters of %d objects with --engine %s to %d "
+             "frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
     begun = time.perf_counter()
     until = begun + 60 * options.minutes if until is None else until

@@ -182,12 +182,12 @@ def pose_problem(
     tracked = set(truth.keypoints.object_id.tolist())
     scene = replace(scene, objects=tuple(o for o in scene.objects if o.id in tracked))
     if not scene.objects:
-        raise InputError(f"{where}: has no object of this scene in it; their ids must be the same")
+        raise InputError(f"{where}: contains no object of this scene; give a motion with the same object ids")
     rows = torch.cat([_spread(truth.keypoints, o.id, options) for o in scene.objects])
     keypoints = Keypoints(truth.keypoints.rest[rows], truth.keypoints.object_id[rows])
     frames = truth.positions[: options.frames or None, rows]
     if len(frames) < 3:
-        raise InputError(f"{where}: has {len(frames)} frames; motion is seen in three or more")
+        raise InputError(f"{where}: has {len(frames)} frames; give three or more")
     prompts = replace(prompts, velocity={}, lift=_lifts(scene, keypoints, frames, prompts, where))
     simulate = SimulateOptions(
         steps=len(frames), dt=truth.info.dt, engine=options.engine, quality=options.quality, seed=options.seed,
@@ -205,7 +205,7 @@ def pose_problem(
     posed = Problem(scene, keypoints, frames, prompts, simulate, materials, (), noise)
     parameters = _parameters(posed)
     if not parameters:
-        raise InputError(f"{where}: nothing moves in it")
+        raise InputError(f"{where}: no object moves; give a motion in which objects move")
     return replace(posed, parameters=tuple(parameters))
 
 
@@ -245,8 +245,9 @@ def _lifts(
             lifts[o.id] = float(moved[:, 2].mean())
         moved = moved - torch.tensor([0.0, 0.0, lifts.get(o.id, 0.0)])
         if float(moved.square().sum(1).mean().sqrt()) > MISPLACED * float(_size(keypoints, o.id)):
-            raise InputError(f"{where}: object {o.id} ({o.name}) starts elsewhere than in the scene; the scene must be "
-                             "that of the first frame")  # fmt: skip
+            raise InputError(f"{where}: object {o.id} ({o.name}) starts at another position than in the scene; "
+                             "the scene must be "
+                             "the state in the first frame")  # fmt: skip
     return lifts
 
 
@@ -264,7 +265,7 @@ def _parameters(problem: Problem) -> list[Parameter]:
         size = float(_size(problem.keypoints, o.id))
         centre, still = problem.track[:, mine].mean(1), STILL * size
         if float((centre - centre[0]).norm(dim=1).max()) < still or o.id in problem.prompts.pinned:
-            log.info("object %d (%s) does not move; its material stays", o.id, o.name)
+            log.info("object %d (%s) does not move; its material is not fitted", o.id, o.name)
             continue
         chosen = [name for name in names if name != "density" or weighed]
         weighed = True

@@ -50,7 +50,7 @@ def find_answers(paths: Sequence[Path]) -> list[Path]:
     for path in map(Path, paths):
         inside = sorted(path.glob("*.json")) if path.is_dir() else [path]
         if not inside:
-            raise InputError(f"{path}: has no answers (.json) in it")
+            raise InputError(f"{path}: contains no answers (.json); give the files that participants returned")
         found += inside
     return found
 
@@ -66,10 +66,10 @@ def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
     for row, path in enumerate(paths):
         data = read_json_file(path, "the answers of a participant")
         if data.get("study") != key["study"] or str(data.get("participant")) not in participants:
-            raise InputError(f"{path}: is not of the study {study}; leave it out")
+            raise InputError(f"{path}: does not belong to the study {study}; leave it out")
         who = str(data["participant"])
         if who in seen:
-            raise InputError(f"{path}: is of participant {who}, as {seen[who]} is; leave one of them out")
+            raise InputError(f"{path}: is from participant {who}, as is {seen[who]}; leave one of the two out")
         seen[who] = path
         try:
             rated, skipped = _checked(data, participants[who], scales, points)

@@ -10,8 +10,8 @@ from stages.core.options import option, seed_option
 class StudyOptions:
     """Size of a study; the defaults are those of the paper."""
 
-    participants: int = option(61, "number of pages")
-    films: int = option(80, "films per page")
+    participants: int = option(61, "number of participants, each of whom gets one page")
+    films: int = option(80, "number of films per page")
     seed: int = seed_option()
 
     def __post_init__(self):

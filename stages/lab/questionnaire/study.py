@@ -40,7 +40,9 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
     """
     folder, out = Path(folder), Path(out)
     if (out / "key.json").exists():
-        raise InputError(f"{out}: has a study already, whose answers need its key.json; name another folder with -o")
+        raise InputError(
+            f"{out}: already contains a study, whose answers need its key.json; name another folder with -o"
+        )
     films = find_cells(folder)
     pages = out / "pages"
     (pages / "films").mkdir(parents=True, exist_ok=True)
@@ -78,7 +80,7 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
 def find_cells(folder: Path) -> dict[Path, tuple[Path, str, str]]:
     """The films below FOLDER/MODEL/SPLIT or FOLDER/MODEL as (film, model, split); split is "" if there is none."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder; give one that holds a folder of films for each model")
+        raise InputError(f"{folder}: is not a folder; give a folder that contains a folder of films for each model")
     films = {}
     for model in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
         splits = sorted(p for p in model.iterdir() if p.is_dir() and not p.name.startswith("."))
@@ -86,7 +88,9 @@ def find_cells(folder: Path) -> dict[Path, tuple[Path, str, str]]:
             split = home.name if splits else ""
             films |= {film: (film, model.name, split) for film in find_films([home])}
     if not films:
-        raise InputError(f"{folder}: has no folders in it; put the films of each model into a folder of its name")
+        raise InputError(
+            f"{folder}: contains no folders; put the films of each model into a folder named after the model"
+        )
     return films
 
 
@@ -98,7 +102,7 @@ def _encode(film: Path, out: Path) -> float:
         for frames, image in enumerate(read_video(film), 1):  # noqa: B007 -- counted
             video.append(image)
     if frames < 2:
-        raise InputError(f"{film}: has {frames} frames; motion is judged in two or more")
+        raise InputError(f"{film}: has {frames} frames; give a film of two or more")
     return frames / fps
 
 

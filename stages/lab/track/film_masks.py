@@ -59,11 +59,15 @@ def find_film_masks(folder: Path, scene: Scene, films: list[str]) -> FilmMasks:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder; --masks takes one with a folder of label images for each film")
+        raise InputError(
+            f"{folder}: is not a folder; --masks takes a folder that contains a folder of label images for each film"
+        )
     by_name, names = {o.name: row for row, o in enumerate(scene.objects)}, read_names(folder)
     rows = {o.id: row for row, o in enumerate(scene.objects)}
     rows |= {number: by_name[name] for number, name in names.items() if name in by_name}
     masks = FilmMasks(folder, rows, frozenset({IGNORE_LABEL} - rows.keys()))
     if not any(masks.of_film(name) for name in films):
-        raise InputError(f"{folder}: holds no folder of label images named as a film, such as {Path(films[0]).stem}")
+        raise InputError(
+            f"{folder}: contains no folder of label images named like a film, such as {Path(films[0]).stem}"
+        )
     return masks

@@ -40,10 +40,12 @@ def list_films(scene: Scene, folder: Path) -> dict[str, Path]:
     recordings, starts = list_recordings(folder), scene.sequence.starts
     timed = [name for name in scene.cameras.names if name in starts]
     if missing := [name for name in timed if name not in recordings]:
-        log.warning("%s: holds no film named %s; tracking goes on without", folder, ", ".join(missing))
+        log.warning("%s: contains no film named %s; tracking continues without it", folder, ", ".join(missing))
     if len(missing) == len(timed):
         names = ", ".join(scene.cameras.names[:3])
-        raise InputError(f"{folder}: holds no film of the scene's cameras ({names}, ...)")
+        raise InputError(
+            f"{folder}: contains no film of the scene's cameras ({names}, ...); name films like the cameras"
+        )
     return {name: recordings[name] for name in timed if name in recordings}
 
 
@@ -70,7 +72,8 @@ def read_films(
             view = resize(lens.image(image).float() / 255, *size)
             pictures.append((255 * view).round().to(torch.uint8))
             if files and len(pictures) > len(files):
-                raise InputError(f"{files[0].parent}: holds {len(files)} label images, but {recordings[name]} has more "
+                raise InputError(f"{files[0].parent}: contains {len(files)} label images, but {recordings[name]} "
+                                 "has more "
                                  "frames; give one for each")  # fmt: skip
             if files:
                 labels.append(labelled.read(files[len(labels)], cameras, row, size))

@@ -12,10 +12,12 @@ class TrackOptions:
     """How films are read and what is written."""
 
     resolution: int = option(320, "longest side at which frames and renderings are compared [px]")
-    frames: int = option(0, "frames from the release on; 0: until everything rests")
-    masks: Path | None = option(None, "folder with a folder of label images for each film, one for each frame")
-    soft: str = option("", "names of objects that deform, separated by commas; others are rigid")
-    keypoints: int = option(256, "keypoints per object, in the trajectory")
+    frames: int = option(0, "number of frames to track from the release on; 0: until all objects are at rest")
+    masks: Path | None = option(
+        None, "folder that contains a folder of label images for each film, with one image per frame"
+    )
+    soft: str = option("", "names of the objects that deform, separated by commas; all others are tracked as rigid")
+    keypoints: int = option(256, "number of keypoints per object in the trajectory")
     seed: int = seed_option()
     device: str = device_option()
 

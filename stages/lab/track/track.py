@@ -36,7 +36,9 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
     check_output(Path(out), "trajectory")
     world, device = read_scene(scene), pick_device(options.device)
     if world.sequence is None or world.cameras is None:
-        raise InputError(f"{scene}: does not say when its cameras filmed; make it with `ngff reconstruct --sequence`")
+        raise InputError(
+            f"{scene}: does not state when its cameras filmed; reconstruct it with `ngff reconstruct --sequence`"
+        )
     check_objects(world, scene)
     fps, frames = world.sequence.fps, options.frames or world.sequence.frames
     cameras, films = read_films(world, list_films(world, folder), frames, options.resolution, options.masks)

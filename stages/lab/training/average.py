@@ -28,13 +28,15 @@ def run(files: Sequence[Path], given: str, out: Path, half: bool = False) -> str
     """
     ratios = _numbers(given)
     if len(files) != len(ratios) or len(files) < 2 or min(ratios) < 0 or not math.isclose(sum(ratios), 1):
-        raise InputError(f"--ratios {given}: takes a number for each of at least two files; they add up to 1, such as "
+        raise InputError(f"--ratios {given}: give one number for each of at least two files, which add up to 1, "
+                         "such as "
                          "0.7,0.3")  # fmt: skip
     models, cards = zip(*(load(file) for file in files), strict=True)
     for file, card in zip(files[1:], cards[1:], strict=True):
         kinds = [f"{c['model']} {c.get('config')}" for c in (cards[0], card)]
         if kinds[0] != kinds[1]:
-            raise InputError(f"{file}: holds {kinds[1]} and {files[0]} {kinds[0]}; only weights of one model can be "
+            raise InputError(f"{file}: contains {kinds[1]}, but {files[0]} contains {kinds[0]}; only weights of "
+                             "the same model can be "
                              "averaged")  # fmt: skip
     average = models[0]
     for parameters in zip(*(m.parameters() for m in models), strict=True):

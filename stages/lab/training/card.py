@@ -24,7 +24,7 @@ def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
     """
     rows = {Path(card).stem: _read(Path(card)) for card in cards}
     if len(rows) < len(cards):
-        raise InputError("two of the cards have the same name; rename one")
+        raise InputError("CARD.json: two of the cards have the same name; rename one of them")
     panels = [
         Panel(f"{title} by minute", curves={name: _curve(row, key) for name, row in rows.items()})
         for key, title in PANELS.items()

@@ -41,7 +41,7 @@ def train_validation_split(motions: KeypointMotions, count: int) -> tuple[Keypoi
     """Training scenes, and the last `count` (at most a third) for validation. Raises InputError for a single scene."""
     count = max(1, min(count, len(motions) // 3))
     if len(motions) < 2:
-        raise InputError("training needs at least two scenes: one for training, one for validation")
+        raise InputError("--data: give at least two scenes, one for training and one for validation")
     return motions[: len(motions) - count], motions[len(motions) - count :]
 
 

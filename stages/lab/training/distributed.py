@@ -64,7 +64,7 @@ def process_group(device: str, batch: int = 0) -> Iterator[ProcessGroup]:
         yield ProcessGroup(device=device)
         return
     if batch % size:
-        raise InputError(f"--batch {batch}: cannot be divided among {size} processes; take a multiple of {size}")
+        raise InputError(f"--batch {batch}: cannot be divided among {size} processes; give a multiple of {size}")
     if device == "cuda":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")

@@ -16,25 +16,32 @@ class TrainOptions:
     """Budget, batches, loss and optimizer of a training run."""
 
     minutes: float = option(20.0, "training time [min]")
-    steps: int = option(0, "optimizer steps instead of --minutes; 0: use --minutes")
-    batch: int = option(32, "scenes per step")
-    keypoints: int = option(256, "keypoints per object")
-    sparse_keypoints: int = option(0, "keypoints per object in every fourth step; 0: the same in all steps")
+    steps: int = option(0, "number of optimizer steps, instead of --minutes; 0: use --minutes")
+    batch: int = option(32, "number of scenes per step")
+    keypoints: int = option(256, "number of keypoints per object")
+    sparse_keypoints: int = option(
+        0, "number of keypoints per object in every fourth step; 0: --keypoints in all steps"
+    )
     lr: float = option(1e-3, "maximum learning rate")
     horizons: str = option("8,20,40", "rollout length of each phase [frames]")
-    width: int = option(0, "width of the network, may exceed that of --from; 0: the model's default")
+    width: int = option(
+        0, "width of the network, which may exceed the width of the weights of --from; 0: the model's default"
+    )
     loss: str = option(
         "scene",
-        "square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | relative: "
-        "axes, divided by the amount of motion",
+        "loss: square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | relative: "
+        "as axes, divided by the amount of motion",
     )
-    optimizer: str = option("adamw", "adamw | soap (extra `train`)")
-    velocity_weight: float = option(0.0, "weight of velocity errors relative to position errors [s]; 0: none")
-    gradient_discount: float = option(0.9, "factor on the gradient per frame of backpropagation")
+    optimizer: str = option("adamw", "optimizer: adamw | soap (soap needs the extra train)")
+    velocity_weight: float = option(
+        0.0, "weight of velocity errors relative to position errors [s]; 0: ignore velocity errors"
+    )
+    gradient_discount: float = option(0.9, "factor by which the gradient is multiplied per frame of backpropagation")
     groups: str = option(
-        "3_0..3_8", "groups to train on, also varied, solid, turned, meshes; the last 100 scenes are for validation"
+        "3_0..3_8",
+        "groups to train on, also varied, solid, turned, meshes; the last 100 scenes are used for validation",
     )
-    compiled: bool = option(False, "compile the training step first; for GPUs")
+    compiled: bool = option(False, "compile the training step first (only useful on GPUs)")
     seed: int = seed_option()
     device: str = device_option()
     checks: int = 24  # number of validations and checkpoints in the whole run
@@ -47,7 +54,7 @@ class TrainOptions:
         if self.width < 0:
             raise InputError(f"--width {self.width}: must be 0 or more")
         if self.velocity_weight < 0:
-            raise InputError(f"--velocity-weight {self.velocity_weight}: a time in seconds, or 0")
+            raise InputError(f"--velocity-weight {self.velocity_weight}: give a time in seconds, or 0")
         if not 0 <= self.gradient_discount <= 1:
             raise InputError(f"--gradient-discount {self.gradient_discount}: must be between 0 and 1")
         if self.loss not in LOSSES:
@@ -55,7 +62,7 @@ class TrainOptions:
         if self.optimizer not in OPTIMIZERS:
             raise InputError(f"--optimizer {self.optimizer}: choose from {', '.join(OPTIMIZERS)}")
         if min(self.frames) < 1:
-            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
+            raise InputError(f"--horizons {self.horizons}: give numbers of frames, such as 8,20,40")
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -63,7 +70,7 @@ class TrainOptions:
         try:
             return tuple(int(word) for word in self.horizons.split(","))
         except ValueError as error:
-            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}") from error
+            raise InputError(f"--horizons {self.horizons}: give numbers of frames, such as 8,20,40") from error
 
     def horizon(self, progress: float) -> int:
         """Rollout length at a fraction of the budget [frames]."""
@@ -81,11 +88,13 @@ class TrainOptions:
 class SplatterOptions:
     """Length, views, depth and optimizer of a training run of the splat head."""
 
-    steps: int = option(20_000, "optimizer steps")
-    views: int = option(4, "input views per step; one more view is rendered")
-    side: int = option(448, "longest side of an image [px]")
-    depth: str = option("network", "depth of the Gaussians: network | given (true depth, for scenes only)")
-    width: int = option(0, "width of a small random network that replaces the weights, for tests; 0: none")
+    steps: int = option(20_000, "number of optimizer steps")
+    views: int = option(4, "number of input views per step; one more view is rendered for the loss")
+    side: int = option(448, "longest side of the images [px]")
+    depth: str = option("network", "source of the Gaussians' depth: network | given (true depth, for scenes only)")
+    width: int = option(
+        0, "width of a small random network that is used instead of the weights, for tests; 0: use the weights"
+    )
     lr: float = option(1e-4, "maximum learning rate")
     seed: int = seed_option()
     device: str = device_option()
@@ -104,16 +113,16 @@ class SegmenterTraining:
     """Settings of a training run of the segmentation network."""
 
     minutes: float = option(30.0, "training time of the network [min]; 0: train only the candidate scores")
-    steps: int = option(0, "optimizer steps instead of --minutes; 0: use --minutes")
+    steps: int = option(0, "number of optimizer steps, instead of --minutes; 0: use --minutes")
     rate: float = option(2e-3, "maximum learning rate")
-    voxels: int = option(14_000, "largest number of voxels of a training crop")
-    batch: int = option(1, "crops per step")
-    workers: int = option(0, "processes that prepare crops; 0: the training process itself")
+    voxels: int = option(14_000, "maximum number of voxels of a training crop")
+    batch: int = option(1, "number of crops per step")
+    workers: int = option(0, "number of processes that prepare crops; 0: the training process itself")
     seed: int = seed_option()
     device: str = device_option()
     widths: tuple[int, ...] = (32, 48, 64, 96)
-    blocks: int = option(2, "residual blocks of each level, down and up")
-    score_scenes: int = option(200, "augmented scenes whose candidates train the scores")
+    blocks: int = option(2, "number of residual blocks per level, in the encoder and in the decoder")
+    score_scenes: int = option(200, "number of augmented scenes whose candidates train the scores")
     score_steps: int = 3000
 
     def __post_init__(self):

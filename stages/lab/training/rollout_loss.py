@@ -145,7 +145,7 @@ class RolloutLoss:
             why = "gives gradients that are not finite"
         except Exception as error:  # compilers raise many types of exceptions
             why = f"fails ({str(error).strip().splitlines()[0]})"
-        log.warning("compiling the step %s: going on without", why)
+        log.warning("compiling the training step %s: training continues without compilation", why)
         self.advance = _advance
 
     def _chain(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
@@ -178,7 +178,9 @@ class RolloutLoss:
             (self.result,), self.static_inputs = results, static
         except RuntimeError as error:
             torch.cuda.synchronize()
-            log.info("no CUDA graph, continuing step by step: %s", str(error).splitlines()[0])
+            log.info(
+                "no CUDA graph could be recorded, so that steps are launched one by one: %s", str(error).splitlines()[0]
+            )
 
 
 def _advance(

@@ -64,7 +64,7 @@ def fit_scores(
     examples = DataLoader(_Candidates(model, files, scenes, seed), batch_size=None, num_workers=workers)
     found = [item for item in tqdm(examples, total=scenes, desc="candidates", unit="scene") if item is not None]
     if not found:
-        raise InputError(f"none of {scenes} examples has {LARGE} to {MAX_SURFELS} surfels; raise --score-scenes")
+        raise InputError(f"none of {scenes} examples has {LARGE} to {MAX_SURFELS} surfels; increase --score-scenes")
     x, y = (torch.cat(column) for column in zip(*found, strict=True))
     model.feature_mean.copy_(x.mean(0))
     model.feature_scale.copy_(x.std(0) + 1e-6)

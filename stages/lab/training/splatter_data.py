@@ -71,10 +71,10 @@ def read_training_scenes(folder: Path, side: int, device: str = "cpu") -> list[P
     for path in tqdm(sorted(folder.glob("*.ply")), desc="rendering", unit="scene", leave=False):
         scenes.append(render_views(path.stem, read_scene(path), side, device))
     if not scenes:
-        raise InputError(f"{folder}: holds neither scenes (.ply) nor photos with {' or '.join(CAMERA_FILES)}")
+        raise InputError(f"{folder}: contains neither scenes (.ply) nor photos with {' or '.join(CAMERA_FILES)}")
     few = next((s.name for s in scenes if len(s.learned) < 3), None)
     if few:
-        raise InputError(f"{folder}: {few} has too few views; 4 or more are needed")
+        raise InputError(f"{folder}: {few} has too few views; give 4 or more")
     return scenes
 
 

@@ -145,10 +145,13 @@ class TrainingState:
         except torch.cuda.OutOfMemoryError:  # the file is not the cause
             raise
         except Exception as error:  # damaged pickles and values of wrong types raise arbitrary exceptions
-            raise InputError(f"{path}: cannot be read as a checkpoint of a training; start anew") from error
+            raise InputError(
+                f"{path}: cannot be read as a checkpoint of a training; start again without --resume"
+            ) from error
         if different:
-            raise InputError(f"{path}: was made with another {', '.join(different)}; go on with the same, or start "
-                             "anew")  # fmt: skip
+            raise InputError(f"{path}: was written with different values of {', '.join(different)}; use the same "
+                             "values, or start "
+                             "again without --resume")  # fmt: skip
 
     def _take(self, state: dict) -> None:
         """Restore the state written by `save`."""

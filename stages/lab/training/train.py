@@ -56,14 +56,14 @@ def run(
     groups = parse_groups(options.groups, more=EXTRA_GROUPS)
     training, validation = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
     if training.points.shape[1] <= max(options.frames):
-        raise InputError(f"--horizons: the motions have {training.points.shape[1]} frames; take shorter ones")
+        raise InputError(f"--horizons: the motions have {training.points.shape[1]} frames; give shorter rollouts")
     with process_group(pick_device(options.device), options.batch) as processes:
         sums = describe_groups(data, groups)
         state, earlier = _initial_state(model, options, processes.device, start)
         key = _key(model, options, earlier, sums)
         if resume:
             state.load(out.with_suffix(".ckpt"), key)
-            log.info("going on from step %d, %.1f min", state.step, state.elapsed / 60)
+            log.info("resuming at step %d, after %.1f min", state.step, state.elapsed / 60)
         if processes.is_main:
             log.info("%s, %s parameters: %d training scenes, %d validation scenes", model,
                      f"{sum(p.numel() for p in state.params):,}", len(training), len(validation))  # fmt: skip
@@ -189,7 +189,7 @@ class TrainingRun:
             state.save(self.out.with_suffix(".ckpt"), self.key)
             log.info(PROGRESS_LINE.format(**state.curve[-1]))
             if state.curve[-1]["skipped"]:
-                log.warning("%d steps had non-finite gradients and were skipped", state.curve[-1]["skipped"])
+                log.warning("%d steps were skipped, as their gradients were not finite", state.curve[-1]["skipped"])
 
 
 @contextmanager

@@ -16,7 +16,9 @@ def widen(model: ForceField, hidden: int) -> ForceField:
     """
     old = model.config["hidden"]
     if hidden < old:
-        raise InputError(f"--width {hidden}: the weights have {old} channels, and can only be widened")
+        raise InputError(
+            f"--width {hidden}: the initial weights have {old} channels and can only be widened; give a larger width"
+        )
     wide = ForceField(**{**model.config, "hidden": hidden}).to(next(model.parameters()))
     known = model.state_dict()
     for name, new in wide.state_dict().items():

@@ -162,7 +162,7 @@ def test_wrong_files_and_options_are_rejected(tmp_path, trimesh):
     (tmp_path / "shape.fbx").write_bytes(b"x")
     box = textured_box(tmp_path)
     for path, count, up, words in [
-        (tmp_path / "points.ply", 1000, "z", "holds no triangles"),
+        (tmp_path / "points.ply", 1000, "z", "contains no triangles"),
         (tmp_path / "broken.glb", 1000, "z", "cannot be read as a mesh"),
         (tmp_path / "shape.fbx", 1000, "z", "not a readable mesh file"),
         (tmp_path / "absent.obj", 1000, "z", "no such file"),
@@ -254,7 +254,7 @@ def test_folders_are_searched_for_objects(tmp_path):
     assert object_name([tmp_path / "bed/Part1.ply", tmp_path / "bed/Part2.ply"]) == "bed"
     assert object_name([tmp_path / "chair/leg_1.obj", tmp_path / "chair/leg_2.obj"]) == "leg"
     assert object_name([tmp_path / "chair/model.obj"]) == "chair" and object_name([tmp_path / "mug_2.obj"]) == "mug_2"
-    with pytest.raises(InputError, match="holds no meshes; give a folder"):
+    with pytest.raises(InputError, match="contains no meshes; give a folder"):
         (tmp_path / "empty").mkdir()
         find_objects([tmp_path / "empty"])
 
@@ -355,7 +355,7 @@ def test_odd_texture_coordinates_are_read(tmp_path, corners):
     ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "no area"),
     ("v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
     ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read as a mesh"),
-    ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no triangles|cannot be read as a mesh"),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "contains no triangles|cannot be read as a mesh"),
 ], ids=["flat", "line", "point", "nan", "index", "faces"])  # fmt: skip
 def test_meshes_without_a_surface_are_rejected(tmp_path, text, words):
     (tmp_path / "bad.obj").write_text(text)

@@ -215,7 +215,7 @@ def test_table_and_plots_from_results_alone(data, weights, tmp_path, monkeypatch
     for text in ("[]", "no", '{"rows": 3}'):
         (tmp_path / "bad.json").write_text(text)
         done = CliRunner().invoke(app, ["bench", "dynamics", "--from", str(tmp_path / "bad.json")])
-        assert done.exit_code == 2 and "bad.json: holds no results" in done.stderr
+        assert done.exit_code == 2 and "bad.json: contains no results" in done.stderr
     done = CliRunner().invoke(app, ["bench", "dynamics"])
     assert done.exit_code == 2 and "--data" in done.stderr
 
@@ -234,7 +234,7 @@ def test_other_rows_of_the_same_scenes_are_kept(data, weights, tmp_path, monkeyp
     run(data, weights, out, replace(NONE, limit=1))  # previous numbers are for other scenes
     assert list(json.loads(out.read_text())["rows"]) == [FREE_FALL, RIGID_FIT, "gcn"]
     out.write_text("[]")
-    with pytest.raises(InputError, match="results.json: holds no results"):
+    with pytest.raises(InputError, match="results.json: contains no results"):
         run(data, weights, out, NONE)
 
 
@@ -316,7 +316,7 @@ def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tm
 def test_data_without_provenance_are_reported(simulated):
     data, _ = simulated
     write_motions(data / "motions" / "3_9.h5", group("3_9"), {"options": {"dx": 0.02}})
-    with pytest.raises(InputError, match="3_9.h5: has no record of how it was simulated .no spacing.*--mpm 0"):
+    with pytest.raises(InputError, match="3_9.h5: does not record how it was simulated .no spacing.*--mpm 0"):
         Resimulation(data, ["3_9"], "cpu")
 
 

@@ -56,5 +56,5 @@ def test_the_figures_follow_from_each_other(device):
 
 def test_invalid_options_are_rejected():
     for options in ({"frames": 0}, {"particles": (3,)}, {"scenes": -1}):
-        with pytest.raises(InputError, match="--frames at least 1"):
+        with pytest.raises(InputError, match="--frames must be at least 1"):
             MpmBenchOptions(**options)

@@ -87,7 +87,7 @@ def test_photo_folder_is_found(tmp_path):
 def test_a_file_of_something_else_is_not_replaced(tmp_path, content):
     (tmp_path / "images").mkdir()
     (tmp_path / "r.json").write_text(content, encoding="latin-1")
-    with pytest.raises(InputError, match="r.json: holds no results of this benchmark .*; name another file"):
+    with pytest.raises(InputError, match="r.json: contains no results of this benchmark .*; name another file"):
         list(bench.run([tmp_path], tmp_path / "r.json", bench.ReconstructBenchOptions()))
     assert (tmp_path / "r.json").read_text(encoding="latin-1") == content
 

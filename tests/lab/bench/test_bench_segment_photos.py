@@ -77,7 +77,7 @@ def test_folder_of_the_labels(sets):
     assert labels_of(sets / "desk", SegmentPhotosOptions(own)) == own
     own.rename(sets / "desk/labels")
     assert labels_of(sets / "desk", SegmentPhotosOptions()) == sets / "desk/labels"
-    with pytest.raises(InputError, match="labels/desk: holds no names.json; give the folder .* with --labels"):
+    with pytest.raises(InputError, match="labels/desk: contains no names.json; give the folder .* with --labels"):
         labels_of(sets / "desk", SegmentPhotosOptions(sets / "labels"))
 
 

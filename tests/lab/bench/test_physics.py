@@ -87,7 +87,7 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
     list(run(tmp_path / "p.json", more))
     page = (tmp_path / "p.md").read_text()
     assert "| fall/gravity=25 | fall [m] | 0.180 | (9.000) |" in page and "`rigid` 1 of 2" in page
-    with pytest.raises(InputError, match="p.json: has rows measured at --quality draft"):
+    with pytest.raises(InputError, match="p.json: contains rows measured with --quality draft"):
         list(run(tmp_path / "p.json", PhysicsBenchOptions(engines=("rigid",), quality="normal")))
 
 

@@ -253,7 +253,7 @@ def test_rotated_objects_keep_shape_and_material(tmp_path, monkeypatch):
     ("choices", "message"),
     [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0"),
      ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "rotations": 2}, "cannot be combined"),
-     ({"rotations": -1}, "--rotations -1"), ({"dx": 1e-9}, "--dx 1e-09: from 0.011 to 0.2 m"),
+     ({"rotations": -1}, "--rotations -1"), ({"dx": 1e-9}, "--dx 1e-09: must be from 0.011 to 0.2 m"),
      ({"dx": float("nan")}, "--dx nan"), ({"spacing": 0.0}, "--spacing 0"), ({"substep": 0.0}, "--substep 0"),
      ({"substep": float("nan")}, "--substep nan"), ({"frames": 0}, "--frames and"), ({"keypoints": -1}, "--keypoints")],
 )  # fmt: skip

@@ -124,7 +124,7 @@ def test_wrong_inputs_are_reported(published, small, tmp_path):
     out = tmp_path / "t.h5"
     with pytest.raises(InputError, match="is not a folder"):
         importer.run(tmp_path / "none", out)
-    with pytest.raises(InputError, match="has no frames 0000.h5"):
+    with pytest.raises(InputError, match="contains no frames 0000.h5"):
         importer.run(tmp_path, out)
     (published / "0002.h5").rename(published / "0009.h5")
     with pytest.raises(InputError, match="0002.h5 is missing"):
@@ -134,7 +134,7 @@ def test_wrong_inputs_are_reported(published, small, tmp_path):
         first = file["pos"][:]
         del file["pos"]
         file["pos"] = first[:-1]
-    with pytest.raises(InputError, match="0003.h5: has 98 rows and the first frame 99"):
+    with pytest.raises(InputError, match="0003.h5: has 98 rows, but the first frame has 99"):
         importer.run(published, out)
     (published / "0003.h5").write_text("no")
     with pytest.raises(InputError, match="0003.h5: cannot be read"):

@@ -126,7 +126,7 @@ def test_sensitivity_is_the_error_between_two_runs(tmp_path):
     assert row["RMSE"] == pytest.approx((first + second) / 2, rel=1e-2) and row["scenes"] == 2
     assert row["FPE"] == pytest.approx((math.hypot(0.1, 1e-3) + 1e-3) / 2, rel=1e-2)
     assert row["start apart"] == pytest.approx(1e-3, rel=0.02) and line.startswith("| spatial | 2 | 0.00100 |")
-    with pytest.raises(InputError, match="start exactly where those of"):
+    with pytest.raises(InputError, match="have the same initial positions as"):
         sensitivity.run(tmp_path / "a", tmp_path / "a", None, 256, "auto")
     with pytest.raises(InputError, match="has no group"):
         sensitivity.run(tmp_path / "a", tmp_path, None, 256, "auto")

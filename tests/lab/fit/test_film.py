@@ -172,24 +172,24 @@ def test_films_of_other_frame_rates_are_refused(slide, tmp_path):
     with pytest.raises(InputError, match="the same frame rate"):
         timing(problem.scene, scene, {**slow, "camera01.mp4": films[1]}, 0)
     filmed = replace(problem.scene, sequence=FilmedSequence(50.0, 9, {"camera01.mp4": 2.5}))
-    with pytest.raises(InputError, match="camera00.mp4: has 25 frames a second, but the films of .* have 50"):
+    with pytest.raises(InputError, match="camera00.mp4: has 25 frames per second, but the films of .* have 50"):
         timing(filmed, scene, slow, 0)
-    with pytest.raises(InputError, match="does not say when this camera started"):
+    with pytest.raises(InputError, match="does not state when this camera started"):
         timing(filmed, scene, {"camera00.mp4": films[0]}, 0)
     assert timing(filmed, scene, {"camera01.mp4": films[1]}, 4) == FilmedSequence(50.0, 4, {"camera01.mp4": 2.5})
 
 
 def test_films_that_show_nothing_of_the_scene_are_refused(slide, tmp_path):
     _, scene, _, _ = slide
-    with pytest.raises(InputError, match="shows no object where .* has it in the first frame"):
+    with pytest.raises(InputError, match="its first frame shows no object where .* has one"):
         read_film_problem(scene, [still_film(tmp_path / "camera00.mp4")], OPTIONS)
-    with pytest.raises(InputError, match="has 2 frames from the start of the motion on; motion is seen in three"):
+    with pytest.raises(InputError, match="has 2 frames from the start of the motion on; give a film of three"):
         read_film_problem(scene, [still_film(tmp_path / "camera01.mp4", frames=2)], OPTIONS)
 
 
 @pytest.mark.parametrize(("names", "message"), [
-    (("track.h5", "camera00.mp4"), "track.h5: a track is fitted alone"),
-    (("a.h5", "b.h5"), "a.h5: a track is fitted alone"),
+    (("track.h5", "camera00.mp4"), "track.h5: a track cannot be combined"),
+    (("a.h5", "b.h5"), "a.h5: a track cannot be combined"),
     (("notes.txt",), "notes.txt"),
     (("camera00.mp4",), "camera00.mp4: no such file"),
 ])  # fmt: skip

@@ -226,9 +226,9 @@ def test_tracks_that_do_not_fit_the_scene_are_refused(slide):
     nothing = ForcePrompts()
     with pytest.raises(InputError, match="no object of this scene"):
         pose_problem(replace(scene, objects=()), truth, nothing, OPTIONS)
-    with pytest.raises(InputError, match="starts elsewhere"):
+    with pytest.raises(InputError, match="starts at another position"):
         pose_problem(scene, replace(truth, positions=truth.positions + torch.tensor([0.2, 0, 0])), nothing, OPTIONS)
-    with pytest.raises(InputError, match="nothing moves"):
+    with pytest.raises(InputError, match="no object moves"):
         pose_problem(scene, replace(truth, positions=truth.positions[:1].expand(len(truth), -1, -1)), nothing, OPTIONS)
     with pytest.raises(InputError, match="three or more"):
         pose_problem(scene, truth, nothing, replace(OPTIONS, frames=2))

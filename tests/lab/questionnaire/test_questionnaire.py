@@ -95,7 +95,7 @@ def test_pages_say_nothing_of_the_origin(study, films):
 
 
 def test_a_study_with_answers_is_not_overwritten(study, films):
-    with pytest.raises(InputError, match="has a study already"):
+    with pytest.raises(InputError, match="already contains a study"):
         run(films, study, StudyOptions())
 
 
@@ -235,8 +235,8 @@ def test_the_interval_of_the_mean_covers_participants_as_well_as_films(films, tm
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda data: data | {"study": "another"}, "is not of the study"),
-    (lambda data: data | {"participant": "9"}, "is not of the study"),
+    (lambda data: data | {"study": "another"}, "does not belong to the study"),
+    (lambda data: data | {"participant": "9"}, "does not belong to the study"),
     (lambda data: data | {"answers": data["answers"] + data["answers"][:1]}, "is damaged"),
     (lambda data: data | {"answers": [data["answers"][0] | {"PhysR": 6}]}, "is damaged"),
     (lambda data: data | {"answers": [{"film": "x"}]}, "is damaged"),
@@ -253,7 +253,7 @@ def test_two_files_of_one_participant_are_refused_and_unfinished_ones_count(stud
     data = answer(study, "1", lambda model: OPINIONS[model] if model == "ours" else None)
     for name in ("a.json", "b.json"):
         (tmp_path / name).write_text(json.dumps(data))
-    with pytest.raises(InputError, match="leave one of them out"):
+    with pytest.raises(InputError, match="leave one of the two out"):
         read_answers(study, [tmp_path / "a.json", tmp_path / "b.json"])
     done = CliRunner().invoke(app, ["questionnaire", str(study), "--answers", str(tmp_path / "a.json")])
     assert done.exit_code == 0

@@ -177,11 +177,11 @@ def test_label_images_of_other_films_are_refused(small, tmp_path):
     arguments = folder / "scene.ply", folder / "films", tmp_path / "out.h5"
     with pytest.raises(InputError, match="absent: is not a folder; --masks"):
         list(run(*arguments, TrackOptions(masks=tmp_path / "absent")))
-    with pytest.raises(InputError, match="no folder of label images named as a film, such as camera00"):
+    with pytest.raises(InputError, match="no folder of label images named like a film, such as camera00"):
         list(run(*arguments, TrackOptions(masks=tmp_path)))
     (tmp_path / "camera00").mkdir()
     write_labels(tmp_path / "camera00/0.png", torch.zeros(120, 160, dtype=torch.int64))
-    with pytest.raises(InputError, match="holds 1 label images, but .*camera00.mp4 has more"):
+    with pytest.raises(InputError, match="contains 1 label images, but .*camera00.mp4 has more"):
         list(run(*arguments, TrackOptions(masks=tmp_path)))
 
 

@@ -77,5 +77,5 @@ def test_ratios_must_add_up_to_one(shares, tmp_path):
 
 def test_weights_of_different_models_are_rejected(tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2, of="gcn")
-    with pytest.raises(InputError, match=r"b\.safetensors: holds gcn"):
+    with pytest.raises(InputError, match=r"b\.safetensors: contains gcn"):
         run([a, b], "0.5,0.5", tmp_path / "mean.safetensors")

@@ -235,12 +235,12 @@ def test_other_checkpoints_are_rejected(data, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         run("gcn", data, out, QUICK, resume=True)
     run("gcn", data, out, replace(QUICK, steps=2))
-    with pytest.raises(InputError, match="another steps, lr"):
+    with pytest.raises(InputError, match="different values of steps, lr"):
         run("gcn", data, out, replace(QUICK, lr=0.1), resume=True)
     other = shutil.copytree(data, tmp_path / "other")
     with h5py.File(next(other.rglob("3_0.h5")), "a") as file:
         file.attrs["note"] = "made again"
-    with pytest.raises(InputError, match="another data"):
+    with pytest.raises(InputError, match="different values of data"):
         run("gcn", other, out, replace(QUICK, steps=2), resume=True)
     state = torch.load(out.with_suffix(".ckpt"), weights_only=True)
     torch.save({k: v for k, v in state.items() if k != "optimizer"}, out.with_suffix(".ckpt"))

@@ -90,7 +90,7 @@ def test_posed_photos_are_read_with_their_cameras(tmp_path):
 
 
 def test_inconsistent_options_are_reported(folder, tmp_path):
-    with pytest.raises(InputError, match="holds neither scenes"):
+    with pytest.raises(InputError, match="contains neither scenes"):
         list(run(tmp_path / "data" / "..", tmp_path / "w.safetensors", QUICK))
     write_set(folder / "table", arc(5, (64, 48)))
     with pytest.raises(InputError, match="--depth given: table is a set of photos"):

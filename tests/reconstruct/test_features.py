@@ -24,5 +24,5 @@ def test_errors_of_colmap_in_writing_name_the_folder(tmp_path):
 
 def test_a_path_that_is_too_long_for_a_database_is_refused(tmp_path):
     folder = tmp_path / ("d" * 200) / ("e" * 240)
-    with pytest.raises(InputError, match="has [0-9]+ bytes; .* a shorter path"), features.writing_database(folder):
+    with pytest.raises(InputError, match="has [0-9]+ bytes, .* a shorter path"), features.writing_database(folder):
         pass

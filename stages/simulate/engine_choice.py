@@ -192,10 +192,9 @@ def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) ->
         parts = choices[o.id].several
         held = any(part.pinned for part in parts)
         if parts:
-            log.warning("object %d (%s): --engine %s supports one material per object and uses the average of "
-                        "the object's parts"
-                        "%s; with --engine mpm each part has its own material", o.id, o.name, options.engine,
-                        ", and holds the whole object fixed" * held)  # fmt: skip
+            log.warning("object %d (%s): --engine %s supports one material per object and uses the average of the "
+                        "object's parts%s; with --engine mpm each part has its own material", o.id, o.name,
+                        options.engine, ", and holds the whole object fixed" * held)  # fmt: skip
         prompts = replace(prompts, pinned=prompts.pinned | {o.id}) if held else prompts
     return prompts
 

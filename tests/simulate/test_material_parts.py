@@ -92,7 +92,7 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
     heavy, light = 1500 * volume / 3, 300 * volume * 2 / 3  # masses of the parts [kg]
     # the border between the parts, at 1/3 of the height, is displaced by up to a voxel of 8 mm, or 8 % of POT
     assert sum(masses(caplog.text)) == pytest.approx(heavy + light, rel=0.08)
-    assert ("the average of its parts" in caplog.text) == (engine != "mpm")
+    assert ("the average of the object's parts" in caplog.text) == (engine != "mpm")
     if engine == "mpm":
         assert masses(caplog.text) == pytest.approx([heavy, light], rel=0.08)
     centre = (heavy * 0.05 + light * 0.2) / (heavy + light)

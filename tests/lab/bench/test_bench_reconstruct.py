@@ -52,7 +52,7 @@ def test_photos_are_matched_by_name():
     true = ring(6)
     error = bench.pose_error(elsewhere(true)[[4, 1, 0, 3]], true)
     assert error.cameras == 4 and error.rotation_most < 0.05
-    with pytest.raises(InputError, match="name 2 of the photos"):
+    with pytest.raises(InputError, match="include 2 of the photos"):
         bench.pose_error(true[[0, 1]], true)
 
 

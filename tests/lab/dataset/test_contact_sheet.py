@@ -17,7 +17,7 @@ SIZE, CAPTION = 64, 20  # size of an image and height of its caption [px]
 def test_one_row_per_scene_from_first_to_last_frame(tmp_path, monkeypatch):
     shrink(monkeypatch.setattr, monkeypatch.setitem)
     monkeypatch.setattr(contact_sheet, "IMAGE_SIZE", SIZE)
-    with pytest.raises(InputError, match="has none of 3_9"):
+    with pytest.raises(InputError, match="contains none of 3_9"):
         write_sheet(tmp_path, tmp_path / "s.jpg", SheetOptions(groups=("3_9",), count=2))
     generate.run(tmp_path, replace(OPTIONS, groups="3_9,4", parts="motions", frames=20))
     write_sheet(tmp_path, tmp_path / "s.jpg", SheetOptions(groups=("3_9", "4"), count=2))

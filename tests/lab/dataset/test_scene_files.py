@@ -191,7 +191,7 @@ def test_full_disk_is_reported_before_writing(tmp_path, monkeypatch):
     shrink(monkeypatch.setattr, monkeypatch.setitem)
     usage = disk_usage.shutil.disk_usage(tmp_path)._replace(free=500_000)
     monkeypatch.setattr(disk_usage.shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(InputError, match="about .* are needed but 500 kB are free; choose fewer"):
+    with pytest.raises(InputError, match="about .* are needed, but 500 kB are free; choose fewer"):
         generate.run(tmp_path, OPTIONS)
     assert not (tmp_path / "mpm").exists()
 

@@ -106,7 +106,7 @@ def test_command_writes_and_prints_statistics(tmp_path):
     assert facts["groups"]["3_9"]["contained"] == 0.5 and facts["groups"]["3_9"]["scenes with touch"] == 1
     assert facts["objects"]["ball"]["falls"] == 1 and facts["objects"]["bowl"]["falls"] == 0
     assert "| 3_9 | 1 |" in done.stdout
-    with pytest.raises(InputError, match="has none of 4"):
+    with pytest.raises(InputError, match="contains none of 4"):
         scene_statistics.run(tmp_path, None, ["4"], 512, "auto")
 
 

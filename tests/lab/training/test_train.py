@@ -223,7 +223,7 @@ def test_training_from_weights_extends_their_runs(data, tmp_path):
     for p, q in zip(a.parameters(), b.parameters(), strict=True):
         assert_close(p, q, rtol=0, atol=1e-8)
     run("gcn", data, second, still, resume=True, start=first)
-    with pytest.raises(InputError, match="another from"):
+    with pytest.raises(InputError, match="different values of from"):
         run("gcn", data, second, still, resume=True)
     for wrong in ({"model": "ngff"}, {"model": "gcn", "options": replace(still, width=16)}):
         with pytest.raises(InputError, match="first.safetensors: holds gcn"):

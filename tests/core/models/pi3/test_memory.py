@@ -63,7 +63,7 @@ def test_hundred_photos_fit_12_gb_and_the_batch_shrinks_with_the_budget():
 
 
 def test_error_names_the_number_of_photos_that_fit():
-    with pytest.raises(InputError, match=r"100 photos of 448x448 need .* GB.* (\d+) photos would fit") as caught:
+    with pytest.raises(InputError, match=r"100 photos of 448x448 pixels need .* GB.* (\d+) photos would fit") as caught:
         plan(Pi3Config(), 100, (448, 448), False, True, 2 * 10**9)
     count = int(str(caught.value).split(" photos would fit")[0].split()[-1])
     assert plan(Pi3Config(), count, (448, 448), False, True, 2 * 10**9) >= 1

@@ -103,7 +103,7 @@ def set_references(
 
 
 def solve(mujoco, model, data, normal: np.ndarray, friction: np.ndarray, rebounds: np.ndarray) -> None:
-    """Solve for contact forces with exact Coulomb friction, by fixed-point iteration on the slip speeds.
+    """Solve for contact forces with exact Coulomb friction, by an accelerated fixed-point iteration on the slips.
 
     `normal` (k,) has the constraint rows of the contact normals and `friction` (k,) the coefficients. `rebounds` (k,)
     masks the contacts that must reach their target velocity exactly, without the compliance of resting contacts (see
@@ -131,11 +131,11 @@ def solve(mujoco, model, data, normal: np.ndarray, friction: np.ndarray, rebound
 
 
 def next_argument(tried: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
-    """What to try next, to find the argument (k,) at which a function has its argument as value.
+    """The next iterate (k,) of a fixed-point iteration, by Anderson acceleration.
 
-    `errors` are the values less the arguments that were `tried`, the latest last. By Anderson's mixing: repeating the
-    function alone goes on to and fro where a body is wedged between others, as a ball in a groove. Source: Walker and
-    Ni 2011, "Anderson acceleration for fixed-point iterations".
+    `tried` has the previous iterates, the latest last, and `errors` the function's values minus the iterates. Plain
+    iteration oscillates where a body is wedged between others, such as a ball in a groove. Source: Walker and Ni 2011,
+    "Anderson acceleration for fixed-point iterations".
     """
     if len(tried) == 1:
         return tried[0] + errors[0]

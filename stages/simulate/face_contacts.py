@@ -1,9 +1,9 @@
-"""Contacts of the faces of convex bodies, in place of MuJoCo's.
+"""Contact manifolds of faces of convex bodies, which replace contacts that MuJoCo finds.
 
-MuJoCo finds several contacts of two faces only if these are almost parallel. Bodies whose faces are inclined by the
-depth of their contacts then rest on one point, which jumps from one side to the other, and creep. There the face of a
-body that is across MuJoCo's normal is clipped by the opposite face of the other one. Contacts of edges with edges stay
-MuJoCo's, and those with planes.
+MuJoCo generates several contacts for a pair of faces only if the faces are almost parallel. With a slight angle, such
+as that from different penetration depths, a body rests on a single contact, which jumps from side to side, and creeps.
+For these pairs the incident face is clipped against the reference face, the one more nearly perpendicular to MuJoCo's
+normal. Edge-edge contacts and contacts with planes remain those of MuJoCo.
 
 Source: Gregorius 2015, "Robust contact creation for physics simulations" (Game Developers Conference).
 """
@@ -14,16 +14,16 @@ import numpy as np
 
 from stages.simulate.surface_contacts import AddedContacts, add_contacts, extremes
 
-PARALLEL = 6e-4  # 1 - cosine of the angle between faces that count as one, of which the largest is taken: 2 degrees
-ENOUGH = 3  # contacts of a pair from which on MuJoCo's cover an area
-ACROSS = 0.1  # least cosine between a face and the plane of the one that it touches
-ON_SIDE = 1e-5  # distance up to which points are on the side of a face [units of the simulation]
+PARALLEL = 6e-4  # 1 - cosine of the largest angle (2 degrees) between coplanar faces; the largest counts
+ENOUGH = 3  # number of MuJoCo's contacts of a pair that already span an area
+ACROSS = 0.1  # smallest cosine between the contact normal and the normal of a face that takes part
+ON_SIDE = 1e-5  # distance beyond a side of a face up to which points count as inside [simulation units]
 CUBE = np.array([[[1, -1, -1], [1, 1, -1], [1, 1, 1], [1, -1, 1]]], float)
 CUBE = np.concatenate([sign * np.roll(CUBE, axis, 2)[:, ::sign] for axis in range(3) for sign in (1, -1)])
 
 
 class FaceContacts:
-    """Finds the contacts of the polyhedra among a MuJoCo model's geometries."""
+    """Finds the contact manifolds of the boxes and convex meshes among the geometries of a MuJoCo model."""
 
     def __init__(self, mujoco, model):
         self._mujoco, self._model = mujoco, model
@@ -34,7 +34,7 @@ class FaceContacts:
         self._first = np.cumsum([0, *map(len, faces)])
         polygons = [polygon for own in faces for polygon in own]
         self._size = np.array([len(p) for p in polygons], np.int64)
-        most = self._size.max(initial=3)  # corners; where there are not so many the last one is repeated
+        most = self._size.max(initial=3)  # number of corners; faces with fewer repeat the last one
         self._corners = c = np.array([p[np.minimum(np.arange(most), len(p) - 1)] for p in polygons]).reshape(
             -1, most, 3
         )
@@ -42,13 +42,13 @@ class FaceContacts:
         areas = np.linalg.norm(normals, axis=1)
         geom = np.repeat(np.arange(model.ngeom), np.diff(self._first))
         row = np.arange(len(c)) - self._first[geom]
-        self._normals = np.zeros((model.ngeom, row.max(initial=-1) + 1, 3))  # 0 where there are not so many
+        self._normals = np.zeros((model.ngeom, row.max(initial=-1) + 1, 3))  # 0 in unused rows
         self._areas = np.zeros(self._normals.shape[:2])
         self._normals[geom, row], self._areas[geom, row] = normals / np.maximum(areas, 1e-30)[:, None], areas
         self._many = self._first[1:] > self._first[:-1]
 
     def replace(self, data) -> None:
-        """Exclude MuJoCo's contacts of faces, and add others."""
+        """Replace MuJoCo's contacts of pairs of faces that have too few to span an area."""
         model, geom = self._model, data.contact.geom
         if not len(geom):
             return
@@ -56,7 +56,7 @@ class FaceContacts:
         number = geom[rows, 0] * model.ngeom + geom[rows, 1]
         order = rows[np.lexsort((data.contact.dist[rows], number))]
         _, first, count = np.unique(np.sort(number), return_index=True, return_counts=True)
-        deepest = order[first[count < ENOUGH]]  # of each pair
+        deepest = order[first[count < ENOUGH]]  # deepest contact of each pair
         if not len(deepest):
             return
         pairs = geom[deepest].copy()
@@ -66,25 +66,26 @@ class FaceContacts:
         pair, x, normal, depth = pair[k], x[k], normal[k], depth[k]
         replaced = rows[np.isin(number, (pairs[:, 0] * model.ngeom + pairs[:, 1])[pair])]
         data.contact.exclude[replaced] = 1
-        data.contact.efc_address[replaced] = -1  # which MuJoCo leaves undefined where it excludes all contacts
+        data.contact.efc_address[replaced] = -1  # MuJoCo leaves it undefined if all contacts are excluded
         add_contacts(self._mujoco, model, data, AddedContacts(x, normal, depth, pairs[pair]))
 
     def _clipped(
         self, data, pairs: np.ndarray, normal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Contacts of pairs (k, 2) of geometries that touch with normals (k, 3) from the first to the second.
+        """Contacts of pairs (k, 2) of geometries, whose normals (k, 3) point from the first to the second.
 
-        Rows (n,) of the pairs, positions (n, 3), normals (n, 3) and depths (n,), negative for gaps.
+        Returns the row of the pair of each contact (n,), positions (n, 3), normals (n, 3) and penetration depths (n,),
+        which are negative for gaps.
         """
         turn, at = data.geom_xmat[pairs].reshape(-1, 2, 3, 3), data.geom_xpos[pairs]
-        out = np.stack([normal, -normal], 1)  # of each body
+        out = np.stack([normal, -normal], 1)  # outward direction for each body
         cosine = (self._normals[pairs] @ np.einsum("kbij,kbi->kbj", turn, out)[..., None])[..., 0]
         area = np.where(cosine >= cosine.max(2, keepdims=True) - PARALLEL, self._areas[pairs], -1.0)
         face = area.argmax(2)
         cosine = np.take_along_axis(cosine, face[..., None], 2)[..., 0]
         size = np.where(cosine > 1 - PARALLEL, np.take_along_axis(area, face[..., None], 2)[..., 0], 0.0)
         kept = np.flatnonzero((size > 0).any(1) & (cosine > ACROSS).all(1))
-        flat = size[kept].argmax(1)  # the body with the face whose plane counts
+        flat = size[kept].argmax(1)  # the body that has the reference face
         swap = np.stack([flat, 1 - flat], 1)
         pairs, turn, at, face = (np.take_along_axis(v[kept], swap.reshape(swap.shape + (1,) * (v.ndim - 2)), 1)
                                  for v in (pairs, turn, at, face))  # fmt: skip
@@ -100,24 +101,25 @@ class FaceContacts:
 def clipped_faces(
     p: np.ndarray, n: np.ndarray, q: np.ndarray, m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners of the parts of faces q (k, v, 3) that are above or below the opposite faces p (k, v, 3).
+    """Clip incident faces q (k, v, 3) against the prisms above and below reference faces p (k, v, 3).
 
-    n and m (k, 3) are their outward normals, around which corners are in order. Returns the rows (c,) of the faces,
-    positions (c, 3) halfway between both, and depths (c,) below p.
+    n and m (k, 3) are the outward normals of p and q; corners are ordered counter-clockwise about them. Returns, for
+    the corners of the clipped faces, the row of the face (c,), the position halfway between both faces (c, 3), and the
+    depth below p (c,).
     """
     following = np.roll(p, -1, 1)
-    inward = np.cross(n[:, None], following - p)  # across the sides
+    inward = np.cross(n[:, None], following - p)  # normals of the sides of p, in its plane
     inward /= np.maximum(np.linalg.norm(inward, axis=2, keepdims=True), 1e-12)
     offset = (inward * p).sum(2)
-    beyond = offset[:, None] - q @ inward.swapaxes(1, 2)  # of corners of q (k, v of q, v of p)
+    beyond = offset[:, None] - q @ inward.swapaxes(1, 2)  # of corners of q outside sides of p (k, v of q, v of p)
     inside_p = (beyond < ON_SIDE).all(2)
     slope = (m * n).sum(1)
-    height = ((q[:, :1] - p) * m[:, None]).sum(2) / slope[:, None]  # from the corners of p to the plane of q
+    height = ((q[:, :1] - p) * m[:, None]).sum(2) / slope[:, None]  # of the plane of q above the corners of p
     above = p + height[..., None] * n[:, None]
     side = np.cross(m[:, None], np.roll(q, -1, 1) - q)
     side /= np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-12)
     inside_q = ((side * q).sum(2)[:, None] - above @ side.swapaxes(1, 2) < ON_SIDE).all(2)
-    # where sides of q cross planes through sides of p, between both ends of these
+    # intersections of the sides of q with the planes through the sides of p, within these sides
     ends = np.roll(beyond, -1, 1)
     k, i, j = np.nonzero(beyond * ends < 0)
     share = beyond[k, i, j] / (beyond[k, i, j] - ends[k, i, j])

@@ -164,9 +164,9 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
 
 
 def connected(points: Float[Tensor, "n 3"]) -> Tensor:
-    """Mask of the `inliers` and of what is connected to them, as the tip of a cone or a long handle.
+    """Mask of the `inliers` and of the points connected to them, such as the tip of a cone or a long handle.
 
-    Points are linked up to the radius of the largest hole of a closed surface, within which they have a neighbour.
+    Points are connected if they are closer than the radius of the largest hole in the surface, or CLOSED spacings.
     """
     kept = inliers(points)
     if bool(kept.all()):
